@@ -1,0 +1,57 @@
+"""Image augmentation on tensors: random crop (CURL, the paper's table 7), random shift (DrQ), centre crop."""
+
+import torch as th
+from torch.nn import functional as F
+
+
+def _check_crop(images: th.Tensor, size: int) -> None:
+    if images.ndim != 4 or min(images.shape[2:]) < size:
+        raise ValueError(f"cannot crop images of shape {tuple(images.shape)} (batch, channels, height, width) to {size} x {size}")
+
+
+def _cut(images: th.Tensor, top: th.Tensor, left: th.Tensor, height: int, width: int) -> th.Tensor:
+    """Of image i, ``height`` x ``width`` pixels from row ``top[i]`` and column ``left[i]`` on."""
+    views = images.unfold(2, height, 1).unfold(3, width, 1)  # every place at once, nothing copied yet
+    return views[th.arange(len(images), device=images.device), :, top, left]
+
+
+def random_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
+    """
+    Crop every image to ``size`` x ``size`` at a place of its own, uniform over all; the frames of a stack stay together.
+
+    :param images: (batch, channels, height, width), any dtype
+    :param size: Height and width in pixels of what is kept
+    :raises ValueError: when the images are smaller
+    """
+    _check_crop(images, size)
+    batch, _, height, width = images.shape
+    top = th.randint(height - size + 1, (batch,), device=images.device)
+    left = th.randint(width - size + 1, (batch,), device=images.device)
+    return _cut(images, top, left, size, size)
+
+
+def random_shift(images: th.Tensor, pad: int = 4) -> th.Tensor:
+    """
+    Shift every image by up to ``pad`` pixels each way, its border repeated, as in DrQ.
+
+    :param images: (batch, channels, height, width), any dtype; the shape is kept
+    :param pad: Largest shift in pixels
+    """
+    batch, _, height, width = images.shape
+    # Padding by replication knows no integers; pixels are exact in float32.
+    padded = F.pad(images.float(), (pad,) * 4, mode="replicate").to(images.dtype)
+    top, left = th.randint(2 * pad + 1, (2, batch), device=images.device)
+    return _cut(padded, top, left, height, width)
+
+
+def center_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
+    """
+    The middle ``size`` x ``size`` of every image.
+
+    :param images: (batch, channels, height, width), any dtype
+    :param size: Height and width in pixels of what is kept
+    :raises ValueError: when the images are smaller
+    """
+    _check_crop(images, size)
+    top, left = ((length - size) // 2 for length in images.shape[2:])
+    return images[:, :, top : top + size, left : left + size]

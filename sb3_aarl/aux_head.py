@@ -1,0 +1,98 @@
+"""AuxHead: source tokens -> predictor -> operator <- target tokens through the momentum encoder."""
+
+from collections.abc import Callable, Iterable
+
+import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_aarl.aux_loss import AuxLoss, Token
+from sb3_aarl.buffers import WindowSamples
+from sb3_aarl.operators import Operator
+
+
+class AuxHead(nn.Module):
+    """
+    The trainable part of an auxiliary loss beside the encoder: a predictor with one hidden layer, and the operator.
+
+    States go through an encoder, actions and rewards enter source and target as they are (paper, figure 1).
+
+    :param loss: The auxiliary loss
+    :param latent_dim: Width of a latent state
+    :param action_dim: Width of an action
+    :param predictor_width: Hidden units of the predictor, None for twice its input
+    :param predictor_batch_norm: Whether batch norm follows the hidden layer
+    """
+
+    def __init__(
+        self,
+        loss: AuxLoss,
+        latent_dim: int,
+        action_dim: int,
+        predictor_width: int | None = 256,
+        predictor_batch_norm: bool = False,
+    ):
+        super().__init__()
+        self.loss = loss
+        width = {"s": latent_dim, "a": action_dim, "r": 1}
+        source_dim, target_dim = (
+            sum(width[token.kind] for token in tokens) for tokens in (loss.source_tokens, loss.target_tokens)
+        )
+        hidden = 2 * source_dim if predictor_width is None else predictor_width
+        layers: list[nn.Module] = [nn.Linear(source_dim, hidden)]
+        layers += [nn.BatchNorm1d(hidden)] if predictor_batch_norm else []
+        self.predictor = nn.Sequential(*layers, nn.ReLU(), nn.Linear(hidden, target_dim))
+        self.operator = Operator(loss.operator, loss.negatives, target_dim)
+        self.source_offsets = offsets(loss.source_tokens, "s")
+        self.target_offsets = offsets(loss.target_tokens, "s")
+        # The observations that a window has to hold, for WindowReplayBuffer.sample_windows.
+        self.offsets = sorted({*self.source_offsets, *self.target_offsets})
+
+    def forward(
+        self,
+        windows: WindowSamples,
+        encode: Callable[[PyTorchObs], th.Tensor],
+        encode_target: Callable[[PyTorchObs], th.Tensor],
+    ) -> th.Tensor:
+        """
+        The value of the loss, a scalar.
+
+        :param windows: Windows of the loss's horizon with the observations at ``offsets``
+        :param encode: The encoder that is trained, from observations (n, ...) to latent states (n, latent_dim)
+        :param encode_target: The momentum encoder; no gradient is kept of it
+        """
+        source = self._embed(windows, self.loss.source_tokens, encode)
+        with th.no_grad():
+            target = self._embed(windows, self.loss.target_tokens, encode_target)
+        return self.operator(self.predictor(source), target)
+
+    def _embed(
+        self, windows: WindowSamples, tokens: Iterable[Token], encode: Callable[[PyTorchObs], th.Tensor]
+    ) -> th.Tensor:
+        """Latent states, actions and rewards of the tokens side by side, (batch, d); all states in one encoder pass."""
+        tokens = tuple(tokens)
+        batch = len(windows.actions)
+        parts = []
+        places = [self.offsets.index(offset) for offset in offsets(tokens, "s")]
+        if places:
+            parts.append(encode(_select(windows.observations, places)).reshape(batch, -1))
+        parts.append(windows.actions[:, offsets(tokens, "a")].flatten(start_dim=1))
+        parts.append(windows.rewards[:, offsets(tokens, "r")].flatten(start_dim=1))
+        return th.cat(parts, dim=1)
+
+
+def offsets(tokens: Iterable[Token], kind: str) -> list[int]:
+    """
+    Offsets from the window's start of the tokens of one kind.
+
+    :param tokens: Tokens of a loss
+    :param kind: ``s``, ``a`` or ``r``
+    """
+    return [token.offset for token in tokens if token.kind == kind]
+
+
+def _select(observations: th.Tensor | dict[str, th.Tensor], places: list[int]) -> PyTorchObs:
+    """Of windows (batch, time, ...) those places in time, as one batch (batch * len(places), ...)."""
+    if isinstance(observations, dict):
+        return {key: value[:, places].flatten(end_dim=1) for key, value in observations.items()}
+    return observations[:, places].flatten(end_dim=1)

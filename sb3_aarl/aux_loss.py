@@ -1,0 +1,292 @@
+"""AuxLoss: what an auxiliary loss predicts from what, as one immutable value, and its notation."""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import yaml
+
+OPERATORS = ("inner", "bilinear", "cosine", "mse", "n_mse")
+KINDS = "sar"  # state, action, reward: the token of kind KINDS[j] at offset i has index 3 * i + j
+# Guards the parser against a mistyped offset that would ask for a mask of millions of bits.
+LONGEST_HORIZON = 1000
+
+_TOKEN = re.compile(r"([sar])_(?:\{\s*t\s*(?:\+\s*([0-9]+)\s*)?\}|t\s*(?:\+\s*([0-9]+))?)")
+_ARROW = re.compile(r"->|→|\\rightarrow|\\to(?![a-zA-Z])")
+_OPTIONS = re.compile(r"\[([^\[\]]*)\]")
+
+
+class Token(NamedTuple):
+    """One element of the sequence (s_t, a_t, r_t, s_{t+1}, ..., s_{t+k}); ``kind`` is ``s``, ``a`` or ``r``."""
+
+    kind: str
+    offset: int
+
+    @classmethod
+    def of(cls, index: int) -> "Token":
+        """The token at ``index`` of a mask."""
+        return cls(KINDS[index % 3], index // 3)
+
+    @property
+    def index(self) -> int:
+        """The token's place in a mask."""
+        return 3 * self.offset + KINDS.index(self.kind)
+
+    @property
+    def horizon(self) -> int:
+        """The smallest horizon that has this token: actions and rewards lie between two states."""
+        return max(1, self.offset if self.kind == "s" else self.offset + 1)
+
+    def __str__(self) -> str:
+        return f"{self.kind}_t+{self.offset}" if self.offset else f"{self.kind}_t"
+
+    def latex(self) -> str:
+        """The token as the paper prints it, such as ``s_{t+1}``."""
+        return f"{self.kind}_{{t+{self.offset}}}" if self.offset else f"{self.kind}_t"
+
+
+@dataclass(frozen=True)
+class AuxLoss:
+    """
+    An auxiliary loss of the paper's search space (section 2.1): a source mask, a target mask and an operator.
+
+    The masks select tokens of the sequence (s_t, a_t, r_t, s_{t+1}, ..., s_{t+k}), k being the horizon: the state at
+    offset i has index 3i, the action 3i + 1, the reward 3i + 2. The value is frozen, hashable and picklable;
+    ``yaml.safe_dump`` writes it as the mapping of :meth:`to_dict`.
+
+    :param horizon: Number of agent steps k >= 1 that the sequence spans
+    :param source: 3k + 1 booleans, what the prediction is made from (at least one state, paper A.3)
+    :param target: 3k + 1 booleans, what is predicted (not empty, paper A.3)
+    :param operator: How far a prediction is from its target, one of ``OPERATORS`` (paper A.1.3)
+    :param negatives: Whether the operator contrasts with other rows of the batch
+    :raises ValueError: when the loss is not valid; the message names the rule or the token
+    """
+
+    horizon: int
+    source: tuple[bool, ...]
+    target: tuple[bool, ...]
+    operator: str = "mse"
+    negatives: bool = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.horizon, bool) or int(self.horizon) != self.horizon or self.horizon < 1:
+            raise ValueError(f"horizon must be an integer of at least 1, not {self.horizon!r}")
+        object.__setattr__(self, "horizon", int(self.horizon))
+        for name in ("source", "target"):
+            mask = tuple(getattr(self, name))
+            if len(mask) != 3 * self.horizon + 1:
+                raise ValueError(f"{name} has {len(mask)} bits, but horizon {self.horizon} has {3 * self.horizon + 1} tokens")
+            if any(bit not in (False, True) for bit in mask):
+                raise ValueError(f"{name} must be booleans, not {mask}")
+            object.__setattr__(self, name, tuple(bool(bit) for bit in mask))
+        if self.operator not in OPERATORS:
+            raise ValueError(f"unknown operator {self.operator!r}, expected one of {', '.join(OPERATORS)}")
+        object.__setattr__(self, "negatives", bool(self.negatives))
+        if not any(self.source[::3]):
+            named = ", ".join(map(str, self.source_tokens)) or "nothing"
+            raise ValueError(f"the source needs at least one state, or no gradient reaches the encoder; it has {named}")
+        if not any(self.target):
+            raise ValueError("the target is empty: there is nothing to predict")
+
+    @classmethod
+    def from_tokens(
+        cls,
+        source: Iterable[Token],
+        target: Iterable[Token],
+        operator: str = "mse",
+        negatives: bool = False,
+        horizon: int | None = None,
+    ) -> "AuxLoss":
+        """
+        The loss that predicts the tokens ``target`` from the tokens ``source``.
+
+        :param source: Tokens of the source
+        :param target: Tokens of the target
+        :param operator: As in the class
+        :param negatives: As in the class
+        :param horizon: None for the smallest that holds all tokens
+        """
+        source, target = set(source), set(target)
+        longest = max(source | target, key=lambda token: token.horizon, default=Token("s", 0))
+        if horizon is None:
+            horizon = longest.horizon
+        elif horizon < longest.horizon:
+            raise ValueError(f"{longest} needs a horizon of at least {longest.horizon}, not {horizon}")
+        masks = [tuple(Token.of(i) in tokens for i in range(3 * horizon + 1)) for tokens in (source, target)]
+        return cls(horizon, masks[0], masks[1], operator, negatives)
+
+    @classmethod
+    def parse(cls, text: str, operator: str = "mse", negatives: bool = False, horizon: int | None = None) -> "AuxLoss":
+        r"""
+        Read the paper's notation, plain (``{s_t, a_t} -> {s_t+1}``) or LaTeX (``\{s_t, a_t\} \rightarrow \{s_{t+1}\}``).
+
+        What differs from the defaults may follow in brackets, as ``str(loss)`` writes it:
+        ``{s_t} -> {s_t} [bilinear, negatives, horizon=2]``.
+
+        :param text: The notation
+        :param operator: As in the class; brackets in the text win over the default
+        :param negatives: As in the class; brackets in the text win over the default
+        :param horizon: None for the smallest that holds all tokens
+        :raises ValueError: with the position of what cannot be read, or the rule that the loss breaks
+        """
+        parser = _Parser(text)
+        source = parser.tokens()
+        parser.expect(_ARROW, "'->'")
+        target = parser.tokens()
+        options = parser.options()
+        parser.end()
+        given = {"operator": operator, "negatives": negatives, "horizon": horizon}
+        unset = {"operator": "mse", "negatives": False, "horizon": None}
+        for key, value in options.items():
+            if given[key] not in (unset[key], value):
+                raise ValueError(f"{key} is {given[key]!r}, but the notation says {value!r}: {text!r}")
+        return cls.from_tokens(source, target, **{**given, **options})
+
+    @property
+    def source_tokens(self) -> tuple[Token, ...]:
+        """The tokens of the source, in the order of the sequence."""
+        return tuple(Token.of(i) for i, chosen in enumerate(self.source) if chosen)
+
+    @property
+    def target_tokens(self) -> tuple[Token, ...]:
+        """The tokens of the target, in the order of the sequence."""
+        return tuple(Token.of(i) for i, chosen in enumerate(self.target) if chosen)
+
+    def __str__(self) -> str:
+        sets = " -> ".join("{" + ", ".join(map(str, tokens)) + "}" for tokens in (self.source_tokens, self.target_tokens))
+        options = [self.operator] if self.operator != "mse" else []
+        options += ["negatives"] if self.negatives else []
+        smallest = max(token.horizon for token in self.source_tokens + self.target_tokens)
+        options += [f"horizon={self.horizon}"] if self.horizon != smallest else []
+        return f"{sets} [{', '.join(options)}]" if options else sets
+
+    def latex(self) -> str:
+        r"""The masks as the paper prints them, such as ``\{s_t, a_t\} \rightarrow \{s_{t+1}\}``, for math mode."""
+        sets = (", ".join(token.latex() for token in tokens) for tokens in (self.source_tokens, self.target_tokens))
+        return r" \rightarrow ".join(rf"\{{{tokens}\}}" for tokens in sets)
+
+    def canonical(self) -> "AuxLoss":
+        """
+        The same loss, shifted to start at t, with the smallest horizon.
+
+        Windows are drawn uniformly from an episode, so two losses with one canonical form are one loss.
+        """
+        start = min(token.offset for token in self.source_tokens + self.target_tokens)
+        source, target = (
+            [Token(token.kind, token.offset - start) for token in tokens]
+            for tokens in (self.source_tokens, self.target_tokens)
+        )
+        return AuxLoss.from_tokens(source, target, self.operator, self.negatives)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for YAML and JSON; ``AuxLoss.from_dict`` reads them."""
+        plain = AuxLoss(self.horizon, self.source, self.target)
+        notation = str(plain).partition(" [")[0]
+        return {"loss": notation, "horizon": self.horizon, "operator": self.operator, "negatives": self.negatives}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "AuxLoss":
+        """
+        The loss of :meth:`to_dict`; all but ``loss`` may be left out.
+
+        :param values: Mapping with the keys ``loss`` (notation), ``operator``, ``negatives``, ``horizon``
+        """
+        unknown = set(values) - {"loss", "operator", "negatives", "horizon"}
+        if unknown or not isinstance(values.get("loss"), str):
+            problem = f"unknown key {sorted(map(str, unknown))[0]!r}" if unknown else "no notation under 'loss'"
+            raise ValueError(f"{problem} in the auxiliary loss {dict(values)}")
+        return cls.parse(**{"text" if key == "loss" else key: value for key, value in values.items()})
+
+
+# Configurations are plain YAML: a loss is written as a mapping, never as a Python object.
+yaml.SafeDumper.add_representer(AuxLoss, lambda dumper, loss: dumper.represent_dict(loss.to_dict()))
+
+
+class _Parser:
+    """Reads a notation from left to right; every error says where it stands."""
+
+    def __init__(self, text: str):
+        if not isinstance(text, str):
+            raise ValueError(f"a notation is a string such as '{{s_t, a_t}} -> {{s_t+1}}', not {text!r}")
+        self.text = text
+        self.position = 0
+
+    def skip_space(self) -> None:
+        """White space and ``$`` mean nothing, wherever they stand."""
+        while self.position < len(self.text) and (self.text[self.position].isspace() or self.text[self.position] == "$"):
+            self.position += 1
+
+    def fail(self, expected: str) -> ValueError:
+        found = repr(self.text[self.position : self.position + 10]) if self.position < len(self.text) else "the end"
+        return ValueError(f"expected {expected} at position {self.position}, found {found}: {self.text!r}")
+
+    def accept(self, pattern: re.Pattern[str]) -> re.Match[str] | None:
+        self.skip_space()
+        match = pattern.match(self.text, self.position)
+        if match:
+            self.position = match.end()
+        return match
+
+    def expect(self, pattern: re.Pattern[str], expected: str) -> re.Match[str]:
+        match = self.accept(pattern)
+        if match is None:
+            raise self.fail(expected)
+        return match
+
+    def tokens(self) -> list[Token]:
+        """One set: ``{token, token, ...}``, perhaps empty."""
+        self.expect(re.compile(r"\\?\{"), "'{'")
+        tokens: list[Token] = []
+        closing = re.compile(r"\\?\}")
+        while not self.accept(closing):
+            if tokens:
+                self.expect(re.compile(","), "',' or '}'")
+                self.skip_space()
+            start = self.position
+            match = self.expect(_TOKEN, "a token such as s_t, a_t+1 or r_t+2")
+            digits = match[2] or match[3] or "0"
+            # Compared as text first: int() of thousands of digits is an error of its own.
+            if len(digits.lstrip("0")) > 4 or int(digits) > LONGEST_HORIZON:
+                self.position = start
+                raise self.fail(f"an offset of at most {LONGEST_HORIZON}")
+            token = Token(match[1], int(digits))
+            if token in tokens:
+                self.position = start
+                raise self.fail(f"{token} once only")
+            tokens.append(token)
+        return tokens
+
+    def options(self) -> dict[str, Any]:
+        """What stands in brackets behind the sets."""
+        match = self.accept(_OPTIONS)
+        options: dict[str, Any] = {}
+        for word in match[1].split(",") if match else []:
+            word = word.strip()
+            if word in OPERATORS:
+                options["operator"] = word
+            elif word == "negatives":
+                options["negatives"] = True
+            elif re.fullmatch(r"horizon\s*=\s*[0-9]{1,4}", word):
+                options["horizon"] = int(word.partition("=")[2])
+            else:
+                assert match is not None
+                self.position = match.start()
+                raise self.fail(f"an operator, 'negatives' or 'horizon=k' instead of {word!r}")
+        return options
+
+    def end(self) -> None:
+        self.skip_space()
+        if self.position < len(self.text):
+            raise self.fail("nothing more")
+
+
+def search_space_size(max_horizon: int = 10) -> int:
+    """
+    Number of losses in the paper's search space (appendix C): ten operators times two masks of 3k + 1 bits for every k.
+
+    Invalid losses are counted, as in the paper.
+
+    :param max_horizon: Longest horizon k of the space
+    """
+    return 2 * len(OPERATORS) * sum(2 ** (2 * (3 * k + 1)) for k in range(1, max_horizon + 1))

@@ -1,0 +1,432 @@
+"""WindowReplayBuffer: windows of consecutive steps out of a replay buffer that stores each frame once."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.preprocessing import get_obs_shape
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
+
+
+class WindowSamples(NamedTuple):
+    """
+    Windows of one horizon k; ``observations`` is a dict of such tensors for Dict observations.
+
+    :param observations: (batch, k + 1, ...), or (batch, len(offsets), ...) where offsets were asked for
+    :param actions: (batch, k, action_dim), scaled to [-1, 1] as SB3 stores them
+    :param rewards: (batch, k, 1)
+    """
+
+    observations: th.Tensor | dict[str, th.Tensor]
+    actions: th.Tensor
+    rewards: th.Tensor
+
+
+class NoWindowError(ValueError):
+    """No episode in the buffer is long enough for the horizon yet."""
+
+
+class FrameStore:
+    """
+    The frames of one observation key, each once, in a ring that is as long as the buffer plus a stack.
+
+    Transition n (counted from the first one ever added) has its newest frame in row n, so the next observation's is in
+    row n + 1. Where an episode ends, row n + 1 belongs to the next episode; the last frame of the old one lies aside.
+
+    :param buffer_size: Transitions per env that can be read back
+    :param n_envs: Number of envs
+    :param shape: Shape of a stacked observation; frames are stacked along its first axis, oldest first
+    :param dtype: Data type of observations
+    :param stack: Number of frames in an observation
+    """
+
+    def __init__(self, buffer_size: int, n_envs: int, shape: tuple[int, ...], dtype: Any, stack: int):
+        if stack < 1 or (stack > 1 and (not shape or shape[0] % stack)):
+            raise ValueError(f"frame_stack={stack} does not divide the first axis of observations of shape {shape}")
+        self.stack = stack
+        self.shape = shape
+        self.frame_shape = (shape[0] // stack, *shape[1:]) if stack > 1 else shape
+        self.frames = np.zeros((buffer_size + stack, n_envs, *self.frame_shape), dtype)
+        self.final_frames = np.zeros((0, *self.frame_shape), dtype)
+
+    def split(self, observations: np.ndarray) -> np.ndarray:
+        """
+        :param observations: Stacked, (n, *shape)
+        :return: (n, stack, *frame_shape), oldest first
+        """
+        return observations.reshape(len(observations), self.stack, *self.frame_shape)
+
+    def gather(
+        self, newest: np.ndarray, envs: np.ndarray, age: np.ndarray, zero_padded: np.ndarray, final: np.ndarray
+    ) -> np.ndarray:
+        """
+        Stacked observations; all arguments have one shape (...).
+
+        :param newest: Number of the transition whose row holds the newest frame
+        :param envs: Env of each
+        :param age: How many frames of the same episode came before the newest one
+        :param zero_padded: Whether the stack was filled with zeros when the episode began, not with its first frame
+        :param final: Where the newest frame lies aside, -1 where it does not
+        :return: (..., *shape)
+        """
+        back = np.arange(self.stack - 1, -1, -1)
+        rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
+        stacked = self.frames[rows, envs[..., None]]
+        if (final >= 0).any():
+            stacked[..., -1, *(slice(None),) * len(self.frame_shape)][final >= 0] = self.final_frames[final[final >= 0]]
+        before = (back > age[..., None]) & zero_padded[..., None]
+        if before.any():
+            stacked[before] = 0
+        return stacked.reshape(*newest.shape, *self.shape)
+
+    def put_final(self, slot: int, frame: np.ndarray) -> None:
+        """Lay an episode's last frame aside; the space for them doubles when it is full."""
+        if slot >= len(self.final_frames):
+            longer = np.zeros((max(16, 2 * slot), *self.frame_shape), self.frames.dtype)
+            longer[: len(self.final_frames)] = self.final_frames
+            self.final_frames = longer
+        self.final_frames[slot] = frame
+
+
+class _Observations:
+    """
+    Looks like SB3's array (buffer_size, n_envs, *shape) of observations; what is read is put together on the way.
+
+    :param buffer: The buffer
+    :param key: Key of Dict observations, else ""
+    :param following: Whether these are the next observations
+    """
+
+    def __init__(self, buffer: "WindowReplayBuffer", key: str, following: bool):
+        self.buffer = buffer
+        self.key = key
+        self.following = following
+        store = buffer.stores[key]
+        self.shape = (buffer.buffer_size, buffer.n_envs, *store.shape)
+        self.dtype = store.frames.dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        index = index if isinstance(index, tuple) else (index,)
+        where = np.ogrid[: self.shape[0], : self.shape[1]]
+        positions, envs = (part[index[:2]] for part in np.broadcast_arrays(*where))
+        observations = self.buffer.gather(self.key, positions, envs, self.following)
+        return observations[(*(slice(None),) * positions.ndim, *index[2:])]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:], dtype)
+
+
+class WindowReplayBuffer(NStepReplayBuffer):
+    """
+    SB3's replay buffer (n-step returns included) that also gives windows, and stores each frame once.
+
+    Stacks and next observations are put together when they are read. A transition of 3 stacked frames of
+    100 x 100 x 3 bytes takes 30 kB, where SB3's buffer takes 180 kB. Observations that do not follow the last next
+    observation, without an end of the episode in between (a reset by hand, a new env), begin a new episode; the
+    transition before them counts as truncated.
+
+    :param buffer_size: Max number of transitions, all envs together
+    :param observation_space: Observation space, Dict or not
+    :param action_space: Action space
+    :param device: PyTorch device of what is sampled
+    :param n_envs: Number of parallel environments
+    :param optimize_memory_usage: Accepted for SB3; frames are stored once anyway
+    :param handle_timeout_termination: Whether to bootstrap where an episode was truncated
+    :param n_steps: Number of steps of n-step returns in ``sample``
+    :param gamma: Discount of n-step returns
+    :param frame_stack: How many frames the environment stacks along the first axis of an observation, oldest first
+        (channels of images, which SB3 puts first); one number, or one for each key of a Dict. At an episode's begin
+        the first frame may be repeated (Gymnasium's FrameStackObservation) or zeros may fill up (SB3's VecFrameStack)
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        frame_stack: int | Mapping[str, int] = 1,
+    ):
+        # SB3's ReplayBuffer would allocate its two arrays of observations.
+        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs)
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = handle_timeout_termination
+        self.n_steps = n_steps
+        self.gamma = gamma
+
+        parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+        self.stores: dict[str, FrameStore] = {}
+        for key, space in parts.items():
+            stack = frame_stack.get(key, 1) if isinstance(frame_stack, Mapping) else frame_stack
+            shape = get_obs_shape(space)
+            assert isinstance(shape, tuple)
+            self.stores[key] = FrameStore(self.buffer_size, n_envs, shape, space.dtype, stack)
+
+        size = (self.buffer_size, n_envs)
+        self.actions = np.zeros((*size, self.action_dim), self._maybe_cast_dtype(action_space.dtype))
+        self.rewards = np.zeros(size, np.float32)
+        self.dones = np.zeros(size, np.float32)
+        self.timeouts = np.zeros(size, np.float32)
+        self._clear()
+
+    def _clear(self) -> None:
+        size = (self.buffer_size, self.n_envs)
+        self.n_added = 0  # transitions per env ever added; number n lies at position n % buffer_size
+        self._age = np.zeros(size, np.int32)  # steps since the episode began
+        self._zero_padded = np.zeros(size, bool)
+        self._final_slot = np.full(size, -1, np.int64)  # where the last frame of an episode lies aside
+        self._free_slots: list[int] = []
+        self._n_slots = 0
+        self._last_next_obs: dict[str, np.ndarray] = {}
+        self._episode_over = np.ones(self.n_envs, bool)
+
+    def reset(self) -> None:
+        """Forget everything."""
+        super().reset()
+        self._clear()
+
+    @property
+    def observations(self) -> Any:  # type: ignore[override]
+        """What SB3's buffer has under this name: array-like (buffer_size, n_envs, ...), a dict of them for Dict spaces."""
+        return self._as_sb3(following=False)
+
+    @property
+    def next_observations(self) -> Any:  # type: ignore[override]
+        """As ``observations``, one step later and never across the end of an episode."""
+        return self._as_sb3(following=True)
+
+    def _as_sb3(self, following: bool) -> Any:
+        views = {key: _Observations(self, key, following) for key in self.stores}
+        return views if isinstance(self.observation_space, spaces.Dict) else views[""]
+
+    def gather(self, key: str, positions: np.ndarray, envs: np.ndarray, following: bool | np.ndarray = False) -> np.ndarray:
+        """
+        Observations of one key; all arguments broadcast to one shape (...).
+
+        :param key: Key of Dict observations, else ""
+        :param positions: Positions in the buffer
+        :param envs: Envs
+        :param following: Whether to give the next observation instead
+        :return: (..., *observation shape)
+        """
+        positions, envs, following = np.broadcast_arrays(positions, envs, following)
+        # Positions before self.pos were written in this round of the ring, the others in the round before.
+        numbers = self.n_added - self.pos + positions - np.where(positions < self.pos, 0, self.buffer_size)
+        return self.stores[key].gather(
+            numbers + following,
+            envs,
+            self._age[positions, envs] + following,
+            self._zero_padded[positions, envs],
+            np.where(following, self._final_slot[positions, envs], -1),
+        )
+
+    def add(  # type: ignore[override]
+        self,
+        obs: np.ndarray | dict[str, np.ndarray],
+        next_obs: np.ndarray | dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Add one transition of every env.
+
+        :param obs: Observations (n_envs, ...), not normalized
+        :param next_obs: The following observations, of the old episode where it is done
+        :param action: (n_envs, action_dim), scaled to [-1, 1]
+        :param reward: (n_envs,)
+        :param done: (n_envs,), whether the episode ended, for whatever reason
+        :param infos: One dict per env; ``TimeLimit.truncated`` tells truncation from termination
+        :raises ValueError: when a stack is not made of the frames before it; nothing is added then
+        """
+        current, following = self._by_key(obs), self._by_key(next_obs)
+        done = np.asarray(done, bool).reshape(self.n_envs)
+        starts = self._episode_over.copy()
+        for key, last in self._last_next_obs.items():
+            starts |= (current[key] != last).reshape(self.n_envs, -1).any(axis=1)
+        zero_padded = self._check_stacks(current, following, starts, done)
+
+        pos, row = self.pos, self.n_added
+        previous = (pos - 1) % self.buffer_size
+        for env in np.flatnonzero(starts & ~self._episode_over):
+            # A new episode although the old one was not done: its last frame is about to be overwritten.
+            self._lay_aside(previous, env, {key: store.frames[row % len(store.frames), env] for key, store in self.stores.items()})
+            self.timeouts[previous, env] = True
+
+        for env in np.flatnonzero(self._final_slot[pos] >= 0):
+            self._free_slots.append(int(self._final_slot[pos, env]))
+            self._final_slot[pos, env] = -1
+        for key, store in self.stores.items():
+            store.frames[row % len(store.frames)] = store.split(current[key])[:, -1]
+            store.frames[(row + 1) % len(store.frames)] = store.split(following[key])[:, -1]
+        self._age[pos] = np.where(starts, 0, self._age[previous] + 1)
+        self._zero_padded[pos] = np.where(starts, zero_padded, self._zero_padded[previous])
+        self.actions[pos] = np.asarray(action).reshape(self.n_envs, self.action_dim)
+        self.rewards[pos] = reward
+        self.dones[pos] = done
+        self.timeouts[pos] = [self.handle_timeout_termination and info.get("TimeLimit.truncated", False) for info in infos]
+        for env in np.flatnonzero(done):
+            self._lay_aside(pos, env, {key: store.split(following[key])[env, -1] for key, store in self.stores.items()})
+        self._episode_over = done
+        self._last_next_obs = {key: value.copy() for key, value in following.items()}
+
+        self.n_added += 1
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full = True
+            self.pos = 0
+
+    def _by_key(self, obs: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        parts = obs if isinstance(obs, dict) else {"": obs}
+        return {key: np.asarray(parts[key]).reshape(self.n_envs, *store.shape) for key, store in self.stores.items()}
+
+    def _lay_aside(self, pos: int, env: int, frames: dict[str, np.ndarray]) -> None:
+        if not self._free_slots:
+            self._free_slots.append(self._n_slots)
+            self._n_slots += 1
+        slot = self._free_slots.pop()
+        self._final_slot[pos, env] = slot
+        for key, store in self.stores.items():
+            store.put_final(slot, frames[key])
+
+    def _check_stacks(
+        self, current: dict[str, np.ndarray], following: dict[str, np.ndarray], starts: np.ndarray, done: np.ndarray
+    ) -> np.ndarray:
+        """Which envs fill a stack up with zeros (where ``starts``); refuses stacks that frames do not make."""
+        zero_padded = np.zeros(self.n_envs, bool)
+        for key, store in self.stores.items():
+            if store.stack == 1:
+                continue
+            old, new = store.split(current[key]), store.split(following[key])
+            for env in range(self.n_envs):
+                if starts[env] and not (old[env, :-1] == old[env, -1]).all():
+                    if old[env, :-1].any():
+                        raise self._stack_error(key, env, "an episode begins neither with one frame repeated nor with zeros")
+                    zero_padded[env] = True
+                # VecNormalize gives an episode's last observation back with rounding errors.
+                rounded = done[env] and np.issubdtype(new.dtype, np.floating)
+                if not rounded and not (new[env, :-1] == old[env, 1:]).all():
+                    raise self._stack_error(key, env, "the next observation is not the last one plus one new frame")
+        return zero_padded
+
+    def _stack_error(self, key: str, env: int, problem: str) -> ValueError:
+        store = self.stores[key]
+        return ValueError(
+            f"frame_stack={store.stack} does not fit the observations{f' under {key!r}' if key else ''} of shape {store.shape} "
+            f"(env {env}, transition {self.n_added}): {problem}. The stack has to be the outermost observation wrapper, along "
+            "the channels, oldest frame first: RepeatAction, rendering and resizing inside, FrameStackObservation or "
+            "VecFrameStack outside. If observations are no stacks, pass replay_buffer_kwargs=dict(frame_stack=1)"
+        )
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> ReplayBufferSamples | DictReplayBufferSamples:
+        # SB3's own code draws from the arrays that this buffer only seems to have.
+        if isinstance(self.observation_space, spaces.Dict):
+            return DictReplayBuffer._get_samples(self, batch_inds, env)  # type: ignore[arg-type]
+        if self.n_steps > 1:
+            return super()._get_samples(batch_inds, env)
+        return ReplayBuffer._get_samples(self, batch_inds, env)
+
+    def _whole(self, starts: np.ndarray, envs: np.ndarray, horizon: int) -> np.ndarray:
+        """Which windows, given by the age of their first transition in the buffer (0: the oldest), are inside one episode."""
+        inside = starts + horizon <= self.size()
+        steps = self._position(starts[:, None] + np.arange(horizon - 1))
+        over = (self.dones[steps, envs[:, None]] != 0) | (self.timeouts[steps, envs[:, None]] != 0)
+        return inside & ~over.any(axis=1)
+
+    def _position(self, order: np.ndarray) -> np.ndarray:
+        """From the order of transitions (0: the oldest) to positions."""
+        return (order + (self.pos if self.full else 0)) % self.buffer_size
+
+    def _draw_windows(self, batch_size: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        """Starts (in order, 0: the oldest) and envs of windows, uniform over all whole ones."""
+        if horizon < 1:
+            raise ValueError(f"a horizon is at least 1, not {horizon}")
+        size = self.size()
+        drawn: list[tuple[np.ndarray, np.ndarray]] = []
+        missing = batch_size
+        # Mostly all but a few windows are whole: drawing again what is not keeps the rest uniform, and costs nothing.
+        for _ in range(8 if size >= horizon else 0):
+            starts, envs = np.random.randint(size, size=missing), np.random.randint(self.n_envs, size=missing)
+            whole = self._whole(starts, envs, horizon)
+            drawn.append((starts[whole], envs[whole]))
+            missing -= int(whole.sum())
+            if not missing:
+                break
+        if missing:
+            every_start, every_env = (grid.ravel() for grid in np.mgrid[:size, : self.n_envs])
+            whole = np.flatnonzero(self._whole(every_start, every_env, horizon))
+            if not len(whole):
+                raise NoWindowError(f"no episode in the replay buffer spans {horizon} agent steps yet")
+            chosen = whole[np.random.randint(len(whole), size=missing)]
+            drawn.append((every_start[chosen], every_env[chosen]))
+        starts, envs = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        return starts, envs
+
+    def sample_windows(
+        self,
+        batch_size: int,
+        horizon: int,
+        env: VecNormalize | None = None,
+        offsets: Sequence[int] | None = None,
+    ) -> WindowSamples:
+        """
+        Windows of consecutive steps inside one episode of one env, uniform over all whole ones in the buffer.
+
+        :param batch_size: Number of windows
+        :param horizon: Agent steps k of each: k + 1 observations, the k actions and rewards between them
+        :param env: VecNormalize that observations and rewards go through
+        :param offsets: Gather only the observations at these offsets from the start (0 to k); None for all k + 1
+        :raises NoWindowError: when no episode is long enough yet
+        """
+        starts, envs = self._draw_windows(batch_size, horizon)
+        steps = self._position(starts[:, None] + np.arange(horizon))
+        wanted = np.arange(horizon + 1) if offsets is None else np.asarray(offsets, np.int64)
+        # The last observation is the next one of the last step: the episode may have ended there.
+        following = wanted == horizon
+        at = self._position(starts[:, None] + wanted - following)
+        observations = {key: self.gather(key, at, envs[:, None], following) for key in self.stores}
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        normalized = self._normalize_obs(observations if is_dict else observations[""], env)
+        rewards = self._normalize_reward(self.rewards[steps, envs[:, None]][..., None], env)
+        return WindowSamples(
+            {key: self.to_torch(value) for key, value in normalized.items()}
+            if isinstance(normalized, dict)
+            else self.to_torch(normalized),
+            self.to_torch(self.actions[steps, envs[:, None]]),
+            self.to_torch(rewards),
+        )
+
+
+def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
+    """
+    How many frames an environment stacks, as its wrappers tell.
+
+    :param env: Vectorized environment
+    :return: The size of SB3's VecFrameStack times that of Gymnasium's FrameStackObservation, 1 without them; for Dict
+        observations by key, 1 where the first axis is not a multiple of it
+    """
+    outer = unwrap_vec_wrapper(env, VecFrameStack)
+    stack = outer.stacked_obs.n_stack if isinstance(outer, VecFrameStack) else 1
+    if env.has_attr("stack_size"):
+        stack *= int(env.get_attr("stack_size")[0])
+    space = env.observation_space
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    fits = {key: bool(part.shape) and part.shape[0] % stack == 0 for key, part in parts.items()}  # type: ignore[index]
+    stacks = {key: stack if fits[key] else 1 for key in parts}
+    return stacks if isinstance(space, spaces.Dict) else stacks[""]

@@ -1,0 +1,96 @@
+"""The losses with a name: handcrafted ones, AARL-Pixel and AARL-State, and every candidate that the paper published."""
+
+import difflib
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import yaml
+
+from sb3_aarl.aux_loss import AuxLoss, Token
+
+
+class PublishedLoss(NamedTuple):
+    """
+    A candidate of the paper's appendix D.2.
+
+    :param loss: The candidate
+    :param table: Number of the paper's table: 9, 12, 13 or 14
+    :param environment: The task that it was searched on, such as ``Cheetah-Run``
+    :param observation: ``pixel`` or ``state``
+    :param stage: Stage of the evolution, from 1
+    :param rank: Place among the stage's best, from 1
+    """
+
+    loss: AuxLoss
+    table: int
+    environment: str
+    observation: str
+    stage: int
+    rank: int
+
+
+@cache
+def _read() -> dict[str, Any]:
+    return yaml.safe_load(resources.files("sb3_aarl").joinpath("catalog.yml").read_text(encoding="utf-8"))
+
+
+@cache
+def _named() -> Mapping[str, AuxLoss]:
+    losses = {name: AuxLoss.parse(notation) for name, notation in _read()["named"].items()}
+    for k in range(1, 11):
+        now = Token("s", 0)
+        actions = [Token("a", i) for i in range(k)]
+        future = [Token("s", i) for i in range(1, k + 1)]
+        losses[f"atc-{k}"] = AuxLoss.from_tokens([now], future, "bilinear", negatives=True)
+        losses[f"spr-{k}"] = AuxLoss.from_tokens([now, *actions], future, "n_mse")
+    return MappingProxyType(losses)
+
+
+def names() -> list[str]:
+    """The names that :func:`load` knows, sorted; numbers in them by value."""
+    return sorted(_named(), key=lambda name: (name.rstrip("0123456789"), len(name), name))
+
+
+def load(name: str) -> AuxLoss:
+    """
+    The loss of that name.
+
+    :param name: One of :func:`names`
+    :raises ValueError: for an unknown name, with the nearest ones
+    """
+    try:
+        return _named()[name]
+    except (KeyError, TypeError):
+        nearest = difflib.get_close_matches(str(name), names(), cutoff=0.4)
+        hint = f"nearest: {', '.join(nearest)}" if nearest else f"known: {', '.join(names())}"
+        raise ValueError(f"unknown auxiliary loss {name!r}, {hint}") from None
+
+
+@cache
+def published() -> tuple[PublishedLoss, ...]:
+    """Every candidate of the paper's tables 9, 12, 13 and 14, in their order."""
+    return tuple(
+        PublishedLoss(AuxLoss.parse(notation), table["table"], table["environment"], table["observation"], stage, rank)
+        for table in _read()["published"]
+        for stage, candidates in table["stages"].items()
+        for rank, notation in enumerate(candidates, start=1)
+    )
+
+
+def resolve(value: "AuxLoss | str | Mapping[str, Any]") -> AuxLoss:
+    """
+    The loss that a user means: an AuxLoss, a notation, a name of the catalogue, or the mapping of ``AuxLoss.to_dict``.
+
+    :param value: What stands in code, YAML or on the command line
+    :raises ValueError: when it is none of these
+    """
+    if isinstance(value, AuxLoss):
+        return value
+    if isinstance(value, Mapping):
+        return AuxLoss.from_dict(value)
+    if not isinstance(value, str):
+        raise ValueError(f"an auxiliary loss is an AuxLoss, a notation, a name or a mapping, not {value!r}")
+    return AuxLoss.parse(value) if "{" in value or ">" in value else load(value)

@@ -1,0 +1,210 @@
+"""Encoders: SB3 features extractors from observations to the latent states that the auxiliary loss works on."""
+
+from collections.abc import Mapping
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import TensorDict
+from torch import nn
+
+
+def orthogonal_init(module: nn.Module) -> None:
+    """
+    Orthogonal linear layers and delta-orthogonal convolutions, biases zero, as in CURL; for ``Module.apply``.
+
+    Delta-orthogonal: all taps of a kernel are zero but the middle one, which is orthogonal across channels.
+
+    :param module: A layer; what is neither linear nor convolutional stays as it is
+    """
+    if isinstance(module, nn.Linear):
+        nn.init.orthogonal_(module.weight)
+        nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.Conv2d):
+        nn.init.zeros_(module.weight)
+        nn.init.zeros_(module.bias)
+        middle = module.weight[:, :, module.kernel_size[0] // 2, module.kernel_size[1] // 2]
+        with th.no_grad():
+            middle.copy_(nn.init.orthogonal_(th.empty_like(middle), nn.init.calculate_gain("relu")))
+
+
+class Encoder(BaseFeaturesExtractor):
+    """
+    An encoder in two parts: a trunk, and a projection (linear, layer norm) from it to the latent state.
+
+    The actor reads the trunk through a projection of its own, see ``policies.Actor``.
+
+    :param observation_space: The observation space, one key's if it is a Dict
+    :param features_dim: Width of the latent state
+    :param trunk_dim: Width of what the trunk gives
+    :param tanh: Whether to squash the latent state into (-1, 1)
+    """
+
+    projection: nn.Sequential
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int, trunk_dim: int, tanh: bool = False):
+        super().__init__(observation_space, features_dim)
+        self.trunk_dim = trunk_dim
+        self.tanh = tanh
+
+    def make_projection(self) -> nn.Sequential:
+        """A new projection from the trunk to a latent state, with parameters of its own."""
+        layers = [nn.Linear(self.trunk_dim, self.features_dim), nn.LayerNorm(self.features_dim)]
+        return nn.Sequential(*layers, *([nn.Tanh()] if self.tanh else [])).apply(orthogonal_init)
+
+    def trunk(self, observations: th.Tensor) -> th.Tensor:
+        """
+        All but the projection.
+
+        :param observations: (batch, ...) floats as SB3 preprocesses them
+        :return: (batch, trunk_dim)
+        """
+        raise NotImplementedError
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.projection(self.trunk(observations))
+
+
+class PixelEncoder(Encoder):
+    """
+    CURL's encoder (paper, table 7): 3 x 3 convolutions with ReLU, the first with stride 2, then the projection.
+
+    :param observation_space: Images (channels, height, width) of any size from 15 x 15 on; SB3 divides them by 255
+    :param features_dim: Width of the latent state (table 7: 50)
+    :param n_layers: Number of convolutions (table 7: 4)
+    :param n_filters: Filters of each (table 7: 32)
+    :param tanh: Whether to squash the latent state into (-1, 1) (CURL and the paper: no)
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        features_dim: int = 50,
+        n_layers: int = 4,
+        n_filters: int = 32,
+        tanh: bool = False,
+    ):
+        channels, height, width = observation_space.shape
+        # Size after the first convolution (stride 2), then two pixels less for each further one.
+        height, width = ((length - 3) // 2 + 1 - 2 * (n_layers - 1) for length in (height, width))
+        if min(height, width) < 1:
+            raise ValueError(f"images of shape {observation_space.shape} are too small for {n_layers} convolutions")
+        super().__init__(observation_space, features_dim, n_filters * height * width, tanh)
+        layers: list[nn.Module] = []
+        for i in range(n_layers):
+            layers += [nn.Conv2d(channels if i == 0 else n_filters, n_filters, 3, stride=2 if i == 0 else 1), nn.ReLU()]
+        self.convolutions = nn.Sequential(*layers, nn.Flatten()).apply(orthogonal_init)
+        self.projection = self.make_projection()
+
+    def trunk(self, observations: th.Tensor) -> th.Tensor:
+        return self.convolutions(observations)
+
+
+class DenseMLP(Encoder):
+    """
+    Densely connected MLP (paper, figure 5): each layer maps x to [x, ReLU(Wx)].
+
+    :param observation_space: Any space that SB3 can flatten
+    :param features_dim: Width of the latent state (table 8: 40)
+    :param n_layers: Number of dense layers (table 8: 1; 4 in table 6)
+    :param width: Units that each layer adds (table 8: 40)
+    """
+
+    dense = True
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int = 40, n_layers: int = 1, width: int = 40):
+        inputs = [get_flattened_obs_dim(observation_space)]
+        for _ in range(n_layers):
+            inputs.append(inputs[-1] + width if self.dense else width)
+        super().__init__(observation_space, features_dim, inputs[-1])
+        self.layers = nn.ModuleList(nn.Linear(size, width) for size in inputs[:-1]).apply(orthogonal_init)
+        self.projection = self.make_projection()
+
+    def trunk(self, observations: th.Tensor) -> th.Tensor:
+        x = observations.flatten(start_dim=1)
+        for layer in self.layers:
+            added = layer(x).relu()
+            x = th.cat([x, added], dim=1) if self.dense else added
+        return x
+
+
+class MLP(DenseMLP):
+    """Plain MLP for the ablation of the paper's table 6: each layer maps x to ReLU(Wx). Parameters as DenseMLP."""
+
+    dense = False
+
+
+class MultiInputEncoder(Encoder):
+    """
+    For Dict observations: a PixelEncoder for each image, one DenseMLP for all other keys together.
+
+    Each part projects its own trunk; ``make_projection`` gives the actor one projection of all trunks.
+
+    :param observation_space: Dict of images and of anything that SB3 can flatten
+    :param cnn_output_dim: Width of each image's latent state (table 7: 50; the name is SB3's CombinedExtractor's)
+    :param mlp_output_dim: Width of the other keys' latent state (table 8: 40)
+    :param normalized_image: Whether images are floats already, as in SB3's CombinedExtractor
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        cnn_output_dim: int = 50,
+        mlp_output_dim: int = 40,
+        normalized_image: bool = False,
+    ):
+        images, vectors = {}, {}
+        for key, space in observation_space.spaces.items():
+            is_image = is_image_space(space, normalized_image=normalized_image)
+            (images if is_image else vectors)[key] = space
+        encoders: dict[str, Encoder] = {
+            key: PixelEncoder(space, cnn_output_dim) for key, space in images.items() if isinstance(space, spaces.Box)
+        }
+        if vectors:
+            encoders["vectors"] = DenseMLP(spaces.Dict(vectors), mlp_output_dim)
+        super().__init__(
+            observation_space,
+            sum(encoder.features_dim for encoder in encoders.values()),
+            sum(encoder.trunk_dim for encoder in encoders.values()),
+        )
+        self.image_keys, self.vector_keys = list(images), list(vectors)
+        self.encoders = nn.ModuleList(encoders.values())
+
+    def _inputs(self, observations: TensorDict) -> list[th.Tensor]:
+        inputs = [observations[key] for key in self.image_keys]
+        if self.vector_keys:
+            inputs.append(th.cat([observations[key].flatten(start_dim=1) for key in self.vector_keys], dim=1))
+        return inputs
+
+    def trunk(self, observations: TensorDict) -> th.Tensor:  # type: ignore[override]
+        parts = zip(self.encoders, self._inputs(observations), strict=True)
+        return th.cat([encoder.trunk(x) for encoder, x in parts], dim=1)  # type: ignore[operator]
+
+    def forward(self, observations: TensorDict) -> th.Tensor:  # type: ignore[override]
+        parts = zip(self.encoders, self._inputs(observations), strict=True)
+        return th.cat([encoder(x) for encoder, x in parts], dim=1)
+
+
+# The names that plain YAML uses for features_extractor_class.
+ENCODERS: Mapping[str, type[BaseFeaturesExtractor]] = {
+    "pixel": PixelEncoder,
+    "dense_mlp": DenseMLP,
+    "mlp": MLP,
+    "multi_input": MultiInputEncoder,
+    "identity": FlattenExtractor,
+}
+
+
+def encoder_class(name_or_class: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
+    """
+    The features extractor that a policy asks for.
+
+    :param name_or_class: One of ``ENCODERS``, or a class, which is returned as it is
+    :raises ValueError: for an unknown name
+    """
+    if not isinstance(name_or_class, str):
+        return name_or_class
+    if name_or_class not in ENCODERS:
+        raise ValueError(f"unknown encoder {name_or_class!r}, expected one of {', '.join(ENCODERS)} or a class")
+    return ENCODERS[name_or_class]

@@ -1,0 +1,345 @@
+"""Policies of SACAux: actor, critic and momentum target around one encoder, which belongs to the critic."""
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac.policies import Actor as SB3Actor
+from stable_baselines3.sac.policies import SACPolicy
+from torch import nn
+
+from sb3_aarl.augmentation import center_crop, random_crop, random_shift
+from sb3_aarl.encoders import DenseMLP, Encoder, MultiInputEncoder, PixelEncoder, encoder_class, orthogonal_init
+
+AUGMENTATIONS = ("auto", "random_crop", "random_shift", "none")
+
+
+class _CropsImages:
+    """Mixin for SB3 models: images that are larger than ``crop_size`` are cropped to their centre before the encoder."""
+
+    crop_size: int | None
+    observation_space: spaces.Space
+    normalize_images: bool
+
+    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+        return features_extractor(self.preprocess(obs))
+
+    def preprocess(self, obs: PyTorchObs) -> PyTorchObs:
+        """
+        Crop images to their centre unless the augmentation did so at random; then SB3's preprocessing.
+
+        :param obs: Observations (batch, ...), images as bytes
+        """
+        if self.crop_size is not None:
+            size = self.crop_size
+            obs = map_images(obs, self.observation_space, lambda images: center_crop(images, size))
+        return preprocess_obs(obs, self.observation_space, normalize_images=self.normalize_images)
+
+
+def map_images(obs: PyTorchObs, space: spaces.Space, function: Any) -> PyTorchObs:
+    """
+    Apply a function to all images of an observation.
+
+    :param obs: Tensor or dict of tensors (batch, ...)
+    :param space: The observation space, which tells what an image is
+    :param function: From (batch, channels, height, width) to the same
+    """
+    if isinstance(obs, dict):
+        assert isinstance(space, spaces.Dict)
+        return {key: function(value) if is_image_space(space[key]) else value for key, value in obs.items()}
+    return function(obs) if is_image_space(space) else obs
+
+
+class Actor(_CropsImages, SB3Actor):
+    """
+    SB3's actor, which may read the critic's encoder detached.
+
+    :param share_features_extractor: Whether the features extractor is the critic's: then it gets no gradient from
+        here, and a projection (linear, layer norm) of the actor's own follows its trunk
+    :param crop_size: Height and width in pixels that images are cropped to, None for no crop
+    :param squash_log_std: None for SB3's clipping of the log standard deviation to [-20, 2]; bounds such as (-10, 2)
+        for tanh squashing into them
+    :param kwargs: Those of SB3's actor
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        share_features_extractor: bool = False,
+        crop_size: int | None = None,
+        squash_log_std: tuple[float, float] | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(*args, **kwargs)
+        self.share_features_extractor = share_features_extractor
+        self.crop_size = crop_size
+        self.squash_log_std = squash_log_std
+        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        # An encoder that learns nothing, such as SB3's FlattenExtractor, is read as it is.
+        learns = any(parameter.requires_grad for parameter in self.features_extractor.parameters())
+        self.projection: nn.Module = nn.Identity()
+        if share_features_extractor and isinstance(self.features_extractor, Encoder):
+            self.projection = self.features_extractor.make_projection()
+        elif share_features_extractor and learns:
+            layers = nn.Linear(self.features_dim, self.features_dim), nn.LayerNorm(self.features_dim)
+            self.projection = nn.Sequential(*layers).apply(orthogonal_init)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | dict(
+            share_features_extractor=self.share_features_extractor,
+            crop_size=self.crop_size,
+            squash_log_std=self.squash_log_std,
+        )
+
+    def own_parameters(self) -> list[nn.Parameter]:
+        """The parameters that the actor loss trains: all but those of a shared encoder."""
+        shared = set(self.features_extractor.parameters()) if self.share_features_extractor else set()
+        return [parameter for parameter in self.parameters() if parameter not in shared]
+
+    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+        if not self.share_features_extractor:
+            return super().extract_features(obs, features_extractor)
+        with th.no_grad():
+            read = features_extractor.trunk if isinstance(features_extractor, Encoder) else features_extractor
+            trunk = read(self.preprocess(obs))
+        return self.projection(trunk)
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
+        if self.squash_log_std is None or self.use_sde:
+            return super().get_action_dist_params(obs)
+        latent = self.latent_pi(self.extract_features(obs, self.features_extractor))
+        low, high = self.squash_log_std
+        log_std = low + 0.5 * (high - low) * (th.tanh(self.log_std(latent)) + 1)
+        return self.mu(latent), log_std, {}
+
+
+class Critic(_CropsImages, ContinuousCritic):
+    """
+    SB3's critic around the encoder that the critic loss and the auxiliary loss train.
+
+    :param crop_size: Height and width in pixels that images are cropped to, None for no crop
+    :param kwargs: Those of SB3's critic
+    """
+
+    def __init__(self, *args: Any, crop_size: int | None = None, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.crop_size = crop_size
+
+    def encode(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        Latent states.
+
+        :param obs: Observations (batch, ...)
+        :return: (batch, features_dim)
+        """
+        return self.extract_features(obs, self.features_extractor)
+
+    def q_values(self, latent: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        Q-values of all critics.
+
+        :param latent: Latent states (batch, features_dim)
+        :param actions: (batch, action_dim), scaled to [-1, 1]
+        :return: (batch, n_critics)
+        """
+        inputs = th.cat([latent, actions], dim=1)
+        return th.cat([q_network(inputs) for q_network in self.q_networks], dim=1)
+
+
+class SACAuxPolicy(SACPolicy):
+    """
+    Policy class (actor, critic and momentum target) of SACAux.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule
+    :param net_arch: Hidden layers of actor and critic, two of 1024 by default (paper, tables 7 and 8)
+    :param features_extractor_class: The encoder: a name of ``encoders.ENCODERS`` or a class
+    :param features_extractor_kwargs: Its keyword arguments
+    :param share_features_extractor: True (default, CURL's pixel agent): the actor reads the critic's encoder
+        detached, through a projection of its own. False: it has an encoder of its own, which the actor loss trains
+    :param augmentation: What ``augment`` does to images: ``random_crop``, ``random_shift``, ``none``, or ``auto``:
+        crop what is larger than ``crop_size``, shift what is not
+    :param crop_size: Height and width in pixels of cropped images (paper, table 7: 84)
+    :param squash_log_std: None (default, SB3): the log standard deviation is clipped to [-20, 2]. Bounds such as
+        (-10, 2) (the public reference): tanh squashes it into them
+    :param ortho_init: Whether the hidden layers of actor and critic start orthogonal with zero biases (CURL, the
+        reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
+    :param kwargs: activation_fn, use_sde, log_std_init, use_expln, clip_mean, normalize_images, optimizer_class,
+        optimizer_kwargs and n_critics of SB3's SACPolicy
+    """
+
+    actor: Actor
+    critic: Critic
+    critic_target: Critic
+
+    default_encoder: type[BaseFeaturesExtractor] = DenseMLP
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        features_extractor_class: str | type[BaseFeaturesExtractor] | None = None,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        share_features_extractor: bool = True,
+        augmentation: str = "auto",
+        crop_size: int = 84,
+        squash_log_std: tuple[float, float] | None = None,
+        ortho_init: bool = False,
+        **kwargs: Any,
+    ):
+        self.augmentation = resolve_augmentation(augmentation, observation_space, crop_size)
+        self.crop_size = crop_size
+        self.squash_log_std = squash_log_std
+        self.ortho_init = ortho_init
+        encoder = encoder_class(features_extractor_class or self.default_encoder)
+        if issubclass(encoder, MultiInputEncoder) and not kwargs.get("normalize_images", True):
+            features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=[1024, 1024] if net_arch is None else net_arch,
+            features_extractor_class=encoder,
+            features_extractor_kwargs=features_extractor_kwargs,
+            share_features_extractor=share_features_extractor,
+            **kwargs,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        # SB3 shares the actor's encoder with the critic; here it is the critic's, and only a shared one comes first.
+        shared = self.make_features_extractor() if self.share_features_extractor else None
+        self.actor = self.make_actor(shared)
+        self.critic = self.make_critic(shared)
+        if self.ortho_init:
+            for network in (self.actor.latent_pi, self.actor.mu, self.actor.log_std, *self.critic.q_networks):
+                if isinstance(network, nn.Module):
+                    network.apply(orthogonal_init)
+        self.critic_target = self.make_critic()
+        self.critic_target.load_state_dict(self.critic.state_dict())
+        self.critic_target.set_training_mode(False)
+        self.critic_target.requires_grad_(False)
+        self.actor.optimizer = self.make_optimizer(self.actor.own_parameters(), lr_schedule)
+        self.critic.optimizer = self.make_optimizer(list(self.critic.parameters()), lr_schedule)
+
+    def make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
+        """
+        An optimizer of the policy's class and arguments.
+
+        :param parameters: What it trains
+        :param lr_schedule: Its learning rate schedule
+        """
+        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        space = cropped_space(self.observation_space, self.crop_size) if self.crops else self.observation_space
+        return self.features_extractor_class(space, **self.features_extractor_kwargs)
+
+    @property
+    def crops(self) -> bool:
+        """Whether images are cropped, at random in training and to the centre elsewhere."""
+        return self.augmentation == "random_crop"
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return Actor(
+            **kwargs,
+            share_features_extractor=self.share_features_extractor,
+            crop_size=self.crop_size if self.crops else None,
+            squash_log_std=self.squash_log_std,
+        ).to(self.device)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        # To SB3 "shared" means that the critic does not train the encoder. Here it always does.
+        kwargs["share_features_extractor"] = False
+        return Critic(**kwargs, crop_size=self.crop_size if self.crops else None).to(self.device)
+
+    def augment(self, obs: PyTorchObs) -> PyTorchObs:
+        """
+        Augment the images of a batch, each at random.
+
+        :param obs: Observations (batch, ...); vectors stay as they are
+        """
+        if self.augmentation == "random_crop":
+            return map_images(obs, self.observation_space, lambda images: random_crop(images, self.crop_size))
+        if self.augmentation == "random_shift":
+            return map_images(obs, self.observation_space, random_shift)
+        return obs
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | dict(
+            share_features_extractor=self.share_features_extractor,
+            augmentation=self.augmentation,
+            crop_size=self.crop_size,
+            squash_log_std=self.squash_log_std,
+            ortho_init=self.ortho_init,
+        )
+
+
+class CnnPolicy(SACAuxPolicy):
+    """SACAuxPolicy with CURL's pixel encoder by default. Parameters as there."""
+
+    default_encoder = PixelEncoder
+
+
+class MultiInputPolicy(SACAuxPolicy):
+    """SACAuxPolicy for Dict observations of vectors and images. Parameters as there."""
+
+    default_encoder = MultiInputEncoder
+
+
+def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
+    """
+    The images among observations.
+
+    :param space: Observation space, images channel first
+    :return: Key to image space; the key is empty where observations are not a Dict
+    """
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    return {key: part for key, part in parts.items() if isinstance(part, spaces.Box) and is_image_space(part)}
+
+
+def cropped_space(space: spaces.Space, size: int) -> spaces.Space:
+    """
+    The observation space after images were cropped.
+
+    :param space: Observation space, images channel first
+    :param size: Height and width in pixels of cropped images
+    """
+    cropped = {key: spaces.Box(0, 255, (box.shape[0], size, size), box.dtype) for key, box in image_spaces(space).items()}  # type: ignore[arg-type]
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({**space.spaces, **cropped})
+    return cropped.get("", space)
+
+
+def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int) -> str:
+    """
+    What ``augmentation`` means for these observations.
+
+    :param augmentation: One of ``AUGMENTATIONS``
+    :param space: Observation space, images channel first
+    :param crop_size: Height and width in pixels of cropped images
+    :return: ``random_crop``, ``random_shift`` or ``none``
+    :raises ValueError: for an unknown name, and for images that are smaller than the crop
+    """
+    if augmentation not in AUGMENTATIONS:
+        raise ValueError(f"unknown augmentation {augmentation!r}, expected one of {', '.join(AUGMENTATIONS)}")
+    sizes = {key: box.shape[1:] for key, box in image_spaces(space).items()}
+    if not sizes:
+        return "none"
+    if augmentation == "auto":
+        return "random_crop" if min(map(min, sizes.values())) > crop_size else "random_shift"
+    for key, size in sizes.items():
+        if augmentation == "random_crop" and min(size) < crop_size:
+            raise ValueError(
+                f"images{f' under {key!r}' if key else ''} of {size[0]} x {size[1]} pixels are smaller than the crop of "
+                f"{crop_size} x {crop_size}: render them larger, or ask for augmentation='random_shift'"
+            )
+    return augmentation

@@ -1,0 +1,526 @@
+"""SACAux: Soft Actor-Critic whose encoder is also trained with an auxiliary loss."""
+
+import io
+import pathlib
+import random
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
+from stable_baselines3.her import HerReplayBuffer
+from torch.nn import functional as F
+
+from sb3_aarl import catalog
+from sb3_aarl.aux_head import AuxHead
+from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, detect_frame_stack
+from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy, image_spaces
+
+SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
+
+
+class NonFiniteError(FloatingPointError, ValueError):
+    """An observation, reward, loss or parameter is NaN or infinite; the message says which and when."""
+
+
+class SACAux(SAC):
+    """
+    Soft Actor-Critic with an auxiliary loss on its encoder (AARL), around SB3's SAC.
+
+    The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The
+    encoder of the target critic is the momentum encoder of the auxiliary loss. Defaults are the paper's tables 7 and 8
+    unless another source is named; what differs there between tasks has the value of most tasks.
+
+    :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
+    :param env: The environment, or its registered name
+    :param learning_rate: Of actor and critic, may be a schedule (1e-3; 2e-4 for Cheetah-Run)
+    :param buffer_size: Size of the replay buffer in transitions (agent steps)
+    :param learning_starts: Agent steps with random actions before learning starts
+    :param batch_size: Transitions for each critic and actor update (512; 128 during the evolution from pixels)
+    :param tau: Polyak coefficient of the target Q networks; 0 freezes the whole target critic, as in SB3
+    :param gamma: Discount factor
+    :param train_freq: As in SB3
+    :param gradient_steps: As in SB3; -1 for one per transition
+    :param action_noise: As in SB3
+    :param replay_buffer_class: None for ``WindowReplayBuffer``; another class can only go without an auxiliary loss
+    :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is found out from the wrappers unless given
+    :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
+    :param n_steps: Steps of n-step returns, not for Dict observations (as in SB3)
+    :param ent_coef: Entropy coefficient; ``"auto_0.1"`` learns it from 0.1 on
+    :param target_update_interval: Gradient steps between updates of the target critic
+    :param target_entropy: As in SB3
+    :param use_sde: Whether to use gSDE, as in SB3
+    :param sde_sample_freq: As in SB3
+    :param use_sde_at_warmup: As in SB3
+    :param stats_window_size: As in SB3
+    :param tensorboard_log: As in SB3
+    :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``
+    :param verbose: 0 no output, 1 info, 2 debug
+    :param seed: Seed of the pseudo random generators
+    :param device: Device of the networks
+    :param aux_loss: An AuxLoss, its notation, a name of the catalogue, or None for SAC with the same encoder (the
+        paper's baseline). ``"auto"`` is AARL-Pixel if any observation is an image and AARL-State otherwise, and None
+        where neither can be trained: the encoder has no parameters, or the replay buffer gives no windows
+    :param aux_coef: Weight lambda of the auxiliary loss (equation 1). It matters with ``joint_optimizer=True``; by
+        default the auxiliary loss has an Adam of its own, which divides a constant factor out again
+    :param aux_batch_size: Windows for each auxiliary update, None for ``batch_size``
+    :param encoder_tau: Polyak coefficient of the momentum encoder
+    :param encoder_learning_rate: Of the auxiliary loss's optimizer, may be a schedule; None for ``learning_rate``
+        (3e-3 for some pixel tasks)
+    :param joint_optimizer: False (default, CURL and the reference): the auxiliary loss has an optimizer of its own for
+        encoder and predictor, beside the critic's, which trains the encoder too. True (equation 1): one optimizer
+        trains the encoder on the sum of both losses, at ``encoder_learning_rate``
+    :param predictor_width: Hidden units of the predictor (256), None for twice its input (the reference)
+    :param predictor_batch_norm: Whether the predictor has batch norm (the paper names none, the reference has it)
+    :param policy_delay: Gradient steps between updates of actor and entropy coefficient (2: CURL, the reference)
+    :param ent_coef_learning_rate: Of the entropy coefficient, may be a schedule; None for ``learning_rate`` (SB3)
+    :param ent_coef_betas: Adam's betas for the entropy coefficient (SB3: (0.9, 0.999))
+    :param augmentation: ``"random_crop"`` to ``crop_size`` in training with a centre crop elsewhere,
+        ``"random_shift"`` by up to 4 pixels, ``"none"``; ``"auto"`` crops what is larger than ``crop_size`` and shifts
+        what is not. Vectors are never augmented
+    :param crop_size: Height and width in pixels of cropped images
+    :raises ValueError: for arguments that do not fit, with the culprit's name
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": SACAuxPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: SACAuxPolicy
+    actor: Actor
+    critic: Critic
+    critic_target: Critic
+
+    def __init__(
+        self,
+        policy: str | type[SACAuxPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 100_000,
+        learning_starts: int = 1000,
+        batch_size: int = 512,
+        tau: float = 0.01,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto_0.1",
+        target_update_interval: int = 2,
+        target_entropy: str | float = "auto",
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        aux_loss: AuxLoss | str | Mapping[str, Any] | None = "auto",
+        aux_coef: float = 1.0,
+        aux_batch_size: int | None = None,
+        encoder_tau: float = 0.05,
+        encoder_learning_rate: float | Schedule | None = None,
+        joint_optimizer: bool = False,
+        predictor_width: int | None = 256,
+        predictor_batch_norm: bool = False,
+        policy_delay: int = 2,
+        ent_coef_learning_rate: float | Schedule | None = 1e-4,
+        ent_coef_betas: tuple[float, float] = (0.5, 0.999),
+        augmentation: str = "auto",
+        crop_size: int = 84,
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,  # type: ignore[arg-type]
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class,
+            dict(replay_buffer_kwargs or {}),
+            optimize_memory_usage,
+            n_steps,
+            ent_coef,
+            target_update_interval,
+            target_entropy,
+            use_sde,
+            sde_sample_freq,
+            use_sde_at_warmup,
+            stats_window_size,
+            tensorboard_log,
+            None if policy_kwargs is None else dict(policy_kwargs),
+            verbose,
+            seed,
+            device,
+            _init_setup_model=False,
+        )
+        self.aux_loss = aux_loss if aux_loss in (None, "auto") else catalog.resolve(aux_loss)
+        self.aux_coef = aux_coef
+        self.aux_batch_size = aux_batch_size
+        self.encoder_tau = encoder_tau
+        self.encoder_learning_rate = encoder_learning_rate
+        self.joint_optimizer = joint_optimizer
+        self.predictor_width = predictor_width
+        self.predictor_batch_norm = predictor_batch_norm
+        self.policy_delay = policy_delay
+        self.ent_coef_learning_rate = ent_coef_learning_rate
+        self.ent_coef_betas = ent_coef_betas
+        self.augmentation = augmentation
+        self.crop_size = crop_size
+
+        self.aux_head: AuxHead | None = None
+        self.aux_optimizer: th.optim.Optimizer | None = None
+        self._n_aux_skipped = 0
+        self._random_state: dict[str, Any] | None = None
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        # What each argument is called, in case that one of them does not fit.
+        for name in ("policy_delay", "target_update_interval", "crop_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        for name in ("tau", "encoder_tau"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
+
+        own_buffer = self.replay_buffer_class in (None, WindowReplayBuffer)
+        self._check_replay_buffer_class(own_buffer)
+        if own_buffer:
+            # SB3 warns that a buffer class of the user's own goes without n_steps; this one does not.
+            self.replay_buffer_class = None
+            self.replay_buffer = self.replay_buffer or self._make_replay_buffer()
+        policy_kwargs = self.policy_kwargs
+        self.policy_kwargs = {**policy_kwargs, "augmentation": self.augmentation, "crop_size": self.crop_size}
+        super()._setup_model()
+        self.policy_kwargs = policy_kwargs
+        if own_buffer:
+            self.replay_buffer_class = WindowReplayBuffer
+
+        if self.ent_coef_optimizer is not None:
+            assert self.log_ent_coef is not None
+            self.ent_coef_schedule = self._schedule(self.ent_coef_learning_rate)
+            rate = self.ent_coef_schedule(1)
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=rate, betas=self.ent_coef_betas)
+        self._setup_aux_loss(own_buffer)
+
+    def _check_replay_buffer_class(self, own_buffer: bool) -> None:
+        if own_buffer or self.aux_loss is None:
+            return
+        assert self.replay_buffer_class is not None
+        if issubclass(self.replay_buffer_class, HerReplayBuffer):
+            raise ValueError(
+                "HerReplayBuffer cannot be used with an auxiliary loss: relabelled transitions have no window of "
+                "consecutive steps. Pass aux_loss=None to train with HER"
+            )
+        if self.aux_loss != "auto" and not issubclass(self.replay_buffer_class, WindowReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class={self.replay_buffer_class.__name__} gives no windows, which aux_loss={self.aux_loss} "
+                "needs: leave it out, or derive it from sb3_aarl.buffers.WindowReplayBuffer"
+            )
+
+    def _make_replay_buffer(self) -> WindowReplayBuffer:
+        if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
+            self.replay_buffer_kwargs["frame_stack"] = detect_frame_stack(self.env)
+        n_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
+        return WindowReplayBuffer(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            self.device,
+            self.n_envs,
+            **{**self.replay_buffer_kwargs, **(n_steps if self.n_steps > 1 else {})},
+        )
+
+    def _setup_aux_loss(self, own_buffer: bool) -> None:
+        encoder = list(self.critic.features_extractor.parameters())
+        if self.aux_loss == "auto":
+            trainable = bool(encoder) and isinstance(self.replay_buffer, WindowReplayBuffer)
+            name = "aarl-pixel" if image_spaces(self.observation_space) else "aarl-state"
+            self.aux_loss = catalog.load(name) if trainable else None
+            if self.verbose >= 1:
+                print(f"Auxiliary loss: {name if trainable else 'none'}")
+        if self.aux_loss is None:
+            return
+        assert isinstance(self.aux_loss, AuxLoss) and isinstance(self.action_space, spaces.Box)
+        if not encoder:
+            extractor = type(self.critic.features_extractor).__name__
+            raise ValueError(f"{extractor} has no parameters that the auxiliary loss could train: pass aux_loss=None")
+        self.encoder_schedule = self._schedule(self.encoder_learning_rate)
+        self.aux_head = AuxHead(
+            self.aux_loss,
+            self.critic.features_extractor.features_dim,
+            int(np.prod(self.action_space.shape)),
+            self.predictor_width,
+            self.predictor_batch_norm,
+        ).to(self.device)
+        self.aux_optimizer = self.policy.make_optimizer([*encoder, *self.aux_head.parameters()], self.encoder_schedule)
+        if self.joint_optimizer:
+            self.critic.optimizer = self.policy.make_optimizer(self._q_parameters(self.critic), self.lr_schedule)
+
+    def _schedule(self, learning_rate: float | Schedule | None) -> Schedule:
+        if learning_rate is None:
+            return lambda progress_remaining: self.lr_schedule(progress_remaining)
+        return FloatSchedule(learning_rate)
+
+    @staticmethod
+    def _q_parameters(critic: Critic) -> list[th.nn.Parameter]:
+        """The critic's parameters without those of the encoder."""
+        return [parameter for network in critic.q_networks for parameter in network.parameters()]
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        # Batch norm and dropout of the networks that learn; the target critic stays in evaluation mode.
+        self.policy.set_training_mode(True)
+        self._update_learning_rates()
+        assert self.replay_buffer is not None
+        losses: dict[str, list[float]] = {}
+
+        def log(name: str, value: th.Tensor) -> None:
+            if not th.isfinite(value).all():
+                step = f"gradient step {self._n_updates}, agent step {self.num_timesteps}"
+                raise NonFiniteError(f"{name} is {value.item()} at {step}; auxiliary loss: {self.aux_loss}")
+            losses.setdefault(name, []).append(value.item())
+
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            update_actor = self._n_updates % self.policy_delay == 0
+
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            obs = self.policy.augment(batch.observations)
+            next_obs = self.policy.augment(batch.next_observations)
+            # n-step returns discount by gamma ** n_steps, by less where an episode ended.
+            discounts = self.gamma if batch.discounts is None else batch.discounts
+            if self.use_sde:
+                self.actor.reset_noise()
+
+            # Entropy coefficient: as in SB3 before the critic, so that all of this step sees one value of it.
+            ent_coef_loss = None
+            if update_actor:
+                actions_pi, log_prob = self.actor.action_log_prob(obs)
+                log_prob = log_prob.reshape(-1, 1)
+            if self.ent_coef_optimizer is not None:
+                assert self.log_ent_coef is not None and isinstance(self.target_entropy, float)
+                ent_coef = self.log_ent_coef.detach().exp()
+                if update_actor:
+                    ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                    log("ent_coef_loss", ent_coef_loss)
+                    self.ent_coef_optimizer.zero_grad()
+                    ent_coef_loss.backward()
+                    self.ent_coef_optimizer.step()
+            else:
+                ent_coef = self.ent_coef_tensor
+            log("ent_coef", ent_coef)
+
+            # Critic and, through it, the encoder.
+            with th.no_grad():
+                next_actions, next_log_prob = self.actor.action_log_prob(next_obs)
+                next_latent = self.critic_target.encode(next_obs)
+                next_q, _ = self.critic_target.q_values(next_latent, next_actions).min(dim=1, keepdim=True)
+                next_q = next_q - ent_coef * next_log_prob.reshape(-1, 1)
+                target_q = batch.rewards + (1 - batch.dones) * discounts * next_q
+            latent = self.critic.encode(obs)
+            q_values = self.critic.q_values(latent, batch.actions)
+            critic_loss = 0.5 * sum(F.mse_loss(q, target_q) for q in q_values.split(1, dim=1))
+            assert isinstance(critic_loss, th.Tensor)
+            log("critic_loss", critic_loss)
+            self.critic.optimizer.zero_grad()
+            if self.joint_optimizer and self.aux_optimizer is not None:
+                self._backward_aux_loss(log)
+                critic_loss.backward()  # adds to the encoder's gradient
+                self.critic.optimizer.step()
+                self.aux_optimizer.step()
+            else:
+                critic_loss.backward()
+                self.critic.optimizer.step()
+                if self._backward_aux_loss(log):
+                    assert self.aux_optimizer is not None
+                    self.aux_optimizer.step()
+
+            # Actor: the encoder gets no gradient from it.
+            if update_actor:
+                with th.no_grad():
+                    latent = self.critic.encode(obs)
+                min_q, _ = self.critic.q_values(latent, actions_pi).min(dim=1, keepdim=True)
+                actor_loss = (ent_coef * log_prob - min_q).mean()
+                log("actor_loss", actor_loss)
+                self.actor.optimizer.zero_grad()
+                actor_loss.backward()
+                self.actor.optimizer.step()
+
+            # Target critic, its encoder being the momentum encoder.
+            if self._n_updates % self.target_update_interval == 0:
+                self._update_target()
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/aux_skipped", self._n_aux_skipped)
+        for name, values in losses.items():
+            self.logger.record(f"train/{name}", np.mean(values))
+
+    def _backward_aux_loss(self, log: Any) -> bool:
+        """
+        Leave the gradient of the auxiliary loss, and nothing else, on encoder and head.
+
+        :param log: Function of a name and a scalar
+        :return: False if there is no auxiliary loss, or no episode is as long as its horizon yet
+        """
+        if self.aux_head is None:
+            return False
+        assert self.aux_optimizer is not None and isinstance(self.replay_buffer, WindowReplayBuffer)
+        self.aux_optimizer.zero_grad()
+        horizon, offsets = self.aux_head.loss.horizon, self.aux_head.offsets
+        try:
+            windows = self.replay_buffer.sample_windows(
+                self.aux_batch_size or self.batch_size, horizon, env=self._vec_normalize_env, offsets=offsets
+            )
+        except NoWindowError:
+            self._n_aux_skipped += 1
+            return False
+
+        def encode(observations: PyTorchObs) -> th.Tensor:
+            return self.critic.encode(self.policy.augment(observations))
+
+        def encode_target(observations: PyTorchObs) -> th.Tensor:
+            return self.critic_target.encode(self.policy.augment(observations))
+
+        aux_loss = self.aux_head(windows, encode, encode_target)
+        log("aux_loss", aux_loss)
+        (self.aux_coef * aux_loss).backward()
+        trained = self.aux_optimizer.param_groups[0]["params"]
+        gradients = [parameter.grad for parameter in trained if parameter.grad is not None]
+        log("aux_grad_norm", th.nn.utils.get_total_norm(gradients))
+        return True
+
+    def _update_target(self) -> None:
+        # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.
+        if self.tau > 0:
+            polyak_update(self._q_parameters(self.critic), self._q_parameters(self.critic_target), self.tau)
+            encoder, momentum_encoder = self.critic.features_extractor, self.critic_target.features_extractor
+            polyak_update(encoder.parameters(), momentum_encoder.parameters(), self.encoder_tau)
+        # Running means of batch norm are copied, see SB3's issue 996.
+        polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+    def _update_learning_rates(self) -> None:
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        progress = self._current_progress_remaining
+        if self.ent_coef_optimizer is not None:
+            update_learning_rate(self.ent_coef_optimizer, self.ent_coef_schedule(progress))
+        if self.aux_optimizer is not None:
+            update_learning_rate(self.aux_optimizer, self.encoder_schedule(progress))
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self._check_finite("observation", new_obs)
+        self._check_finite("reward", reward)
+        for info in infos:
+            if info.get("terminal_observation") is not None:
+                self._check_finite("terminal observation", info["terminal_observation"])
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+
+    def _check_finite(self, name: str, values: np.ndarray | dict[str, np.ndarray]) -> None:
+        for key, array in values.items() if isinstance(values, dict) else [("", values)]:
+            if np.issubdtype(np.asarray(array).dtype, np.floating) and not np.isfinite(array).all():
+                where = np.argwhere(~np.isfinite(array))[0].tolist()
+                raise NonFiniteError(
+                    f"{name}{f' {key!r}' if key else ''} from the environment is not finite at agent step "
+                    f"{self.num_timesteps} (index {where})"
+                )
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        self._check_finite("observation", self._last_obs)  # type: ignore[arg-type]
+        return result
+
+    def learn(
+        self: SelfSACAux,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "SACAux",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfSACAux:
+        # A loaded model goes on with the random numbers that it was saved with.
+        if self._random_state is not None and not reset_num_timesteps:
+            self._set_random_state(self._random_state)
+        self._random_state = None
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _get_random_state(self) -> dict[str, Any]:
+        return {
+            "python": random.getstate(),
+            "numpy": np.random.get_state(),
+            "torch": th.get_rng_state(),
+            "cuda": th.cuda.get_rng_state_all() if self.device.type == "cuda" else [],
+            "action_space": self.action_space.np_random.bit_generator.state,
+        }
+
+    def _set_random_state(self, state: dict[str, Any]) -> None:
+        random.setstate(state["python"])
+        np.random.set_state(state["numpy"])
+        th.set_rng_state(state["torch"])
+        if self.device.type == "cuda" and len(state["cuda"]) == th.cuda.device_count():
+            th.cuda.set_rng_state_all(state["cuda"])
+        self.action_space.np_random.bit_generator.state = state["action_space"]
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        As in SB3, together with the state of all random generators, so that a loaded model can go on as if it had not
+        stopped: ``load(path, env, force_reset=False)``, ``load_replay_buffer`` and
+        ``learn(..., reset_num_timesteps=False)``.
+
+        :param path: Where to save
+        :param exclude: Attributes that are left out
+        :param include: Attributes that are put in although they are usually left out
+        :raises NonFiniteError: when a parameter is NaN or infinite; what is at ``path`` stays as it is
+        """
+        for name, parameters in self.get_parameters().items():
+            for key, value in parameters.items():
+                if isinstance(value, th.Tensor) and not th.isfinite(value).all():
+                    raise NonFiniteError(f"{name}.{key} is not finite: the model is not saved to {path}")
+        self._random_state = self._get_random_state()
+        try:
+            super().save(path, exclude, include)
+        finally:
+            self._random_state = None
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "ent_coef_schedule", "encoder_schedule"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        if self.aux_head is not None:
+            state_dicts = [*state_dicts, "aux_head", "aux_optimizer"]
+        return state_dicts, variables
