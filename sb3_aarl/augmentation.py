@@ -6,7 +6,9 @@ from torch.nn import functional as F
 
 def _check_crop(images: th.Tensor, size: int) -> None:
     if images.ndim != 4 or min(images.shape[2:]) < size:
-        raise ValueError(f"cannot crop images of shape {tuple(images.shape)} (batch, channels, height, width) to {size} x {size}")
+        raise ValueError(
+            f"cannot crop images of shape {tuple(images.shape)} (batch, channels, height, width) to {size} x {size}"
+        )
 
 
 def _cut(images: th.Tensor, top: th.Tensor, left: th.Tensor, height: int, width: int) -> th.Tensor:

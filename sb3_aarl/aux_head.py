@@ -66,9 +66,7 @@ class AuxHead(nn.Module):
             target = self._embed(windows, self.loss.target_tokens, encode_target)
         return self.operator(self.predictor(source), target)
 
-    def _embed(
-        self, windows: WindowSamples, tokens: Iterable[Token], encode: Callable[[PyTorchObs], th.Tensor]
-    ) -> th.Tensor:
+    def _embed(self, windows: WindowSamples, tokens: Iterable[Token], encode: Callable[[PyTorchObs], th.Tensor]) -> th.Tensor:
         """Latent states, actions and rewards of the tokens side by side, (batch, d); all states in one encoder pass."""
         tokens = tuple(tokens)
         batch = len(windows.actions)

@@ -29,7 +29,7 @@ class Token(NamedTuple):
         return cls(KINDS[index % 3], index // 3)
 
     @property
-    def index(self) -> int:
+    def index(self) -> int:  # type: ignore[override]
         """The token's place in a mask."""
         return 3 * self.offset + KINDS.index(self.kind)
 

@@ -77,7 +77,7 @@ class FrameStore:
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
         stacked = self.frames[rows, envs[..., None]]
         if (final >= 0).any():
-            stacked[..., -1, *(slice(None),) * len(self.frame_shape)][final >= 0] = self.final_frames[final[final >= 0]]
+            stacked[final >= 0, -1] = self.final_frames[final[final >= 0]]
         before = (back > age[..., None]) & zero_padded[..., None]
         if before.any():
             stacked[before] = 0
@@ -264,7 +264,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
         previous = (pos - 1) % self.buffer_size
         for env in np.flatnonzero(starts & ~self._episode_over):
             # A new episode although the old one was not done: its last frame is about to be overwritten.
-            self._lay_aside(previous, env, {key: store.frames[row % len(store.frames), env] for key, store in self.stores.items()})
+            self._lay_aside(
+                previous, env, {key: store.frames[row % len(store.frames), env] for key, store in self.stores.items()}
+            )
             self.timeouts[previous, env] = True
 
         for env in np.flatnonzero(self._final_slot[pos] >= 0):
@@ -294,7 +296,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         parts = obs if isinstance(obs, dict) else {"": obs}
         return {key: np.asarray(parts[key]).reshape(self.n_envs, *store.shape) for key, store in self.stores.items()}
 
-    def _lay_aside(self, pos: int, env: int, frames: dict[str, np.ndarray]) -> None:
+    def _lay_aside(self, pos: int, env: np.intp, frames: dict[str, np.ndarray]) -> None:
         if not self._free_slots:
             self._free_slots.append(self._n_slots)
             self._n_slots += 1
@@ -326,9 +328,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
     def _stack_error(self, key: str, env: int, problem: str) -> ValueError:
         store = self.stores[key]
         return ValueError(
-            f"frame_stack={store.stack} does not fit the observations{f' under {key!r}' if key else ''} of shape {store.shape} "
+            f"frame_stack={store.stack} does not fit observations{f' under {key!r}' if key else ''} of shape {store.shape} "
             f"(env {env}, transition {self.n_added}): {problem}. The stack has to be the outermost observation wrapper, along "
-            "the channels, oldest frame first: RepeatAction, rendering and resizing inside, FrameStackObservation or "
+            "the channels, oldest frame first: action repeat, rendering and resizing inside, FrameStackObservation or "
             "VecFrameStack outside. If observations are no stacks, pass replay_buffer_kwargs=dict(frame_stack=1)"
         )
 

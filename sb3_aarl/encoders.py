@@ -20,13 +20,13 @@ def orthogonal_init(module: nn.Module) -> None:
     """
     if isinstance(module, nn.Linear):
         nn.init.orthogonal_(module.weight)
-        nn.init.zeros_(module.bias)
     elif isinstance(module, nn.Conv2d):
         nn.init.zeros_(module.weight)
-        nn.init.zeros_(module.bias)
         middle = module.weight[:, :, module.kernel_size[0] // 2, module.kernel_size[1] // 2]
         with th.no_grad():
             middle.copy_(nn.init.orthogonal_(th.empty_like(middle), nn.init.calculate_gain("relu")))
+    if isinstance(module, (nn.Linear, nn.Conv2d)) and module.bias is not None:
+        nn.init.zeros_(module.bias)
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -154,7 +154,8 @@ class MultiInputEncoder(Encoder):
         mlp_output_dim: int = 40,
         normalized_image: bool = False,
     ):
-        images, vectors = {}, {}
+        images: dict[str, spaces.Space] = {}
+        vectors: dict[str, spaces.Space] = {}
         for key, space in observation_space.spaces.items():
             is_image = is_image_space(space, normalized_image=normalized_image)
             (images if is_image else vectors)[key] = space

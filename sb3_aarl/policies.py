@@ -89,11 +89,11 @@ class Actor(_CropsImages, SB3Actor):
             self.projection = nn.Sequential(*layers).apply(orthogonal_init)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | dict(
-            share_features_extractor=self.share_features_extractor,
-            crop_size=self.crop_size,
-            squash_log_std=self.squash_log_std,
-        )
+        return super()._get_constructor_parameters() | {
+            "share_features_extractor": self.share_features_extractor,
+            "crop_size": self.crop_size,
+            "squash_log_std": self.squash_log_std,
+        }
 
     def own_parameters(self) -> list[nn.Parameter]:
         """The parameters that the actor loss trains: all but those of a shared encoder."""
@@ -105,7 +105,7 @@ class Actor(_CropsImages, SB3Actor):
             return super().extract_features(obs, features_extractor)
         with th.no_grad():
             read = features_extractor.trunk if isinstance(features_extractor, Encoder) else features_extractor
-            trunk = read(self.preprocess(obs))
+            trunk = read(self.preprocess(obs))  # type: ignore[arg-type]
         return self.projection(trunk)
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
@@ -113,6 +113,7 @@ class Actor(_CropsImages, SB3Actor):
             return super().get_action_dist_params(obs)
         latent = self.latent_pi(self.extract_features(obs, self.features_extractor))
         low, high = self.squash_log_std
+        assert isinstance(self.log_std, nn.Linear)
         log_std = low + 0.5 * (high - low) * (th.tanh(self.log_std(latent)) + 1)
         return self.mu(latent), log_std, {}
 
@@ -274,13 +275,13 @@ class SACAuxPolicy(SACPolicy):
         return obs
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | dict(
-            share_features_extractor=self.share_features_extractor,
-            augmentation=self.augmentation,
-            crop_size=self.crop_size,
-            squash_log_std=self.squash_log_std,
-            ortho_init=self.ortho_init,
-        )
+        return super()._get_constructor_parameters() | {
+            "share_features_extractor": self.share_features_extractor,
+            "augmentation": self.augmentation,
+            "crop_size": self.crop_size,
+            "squash_log_std": self.squash_log_std,
+            "ortho_init": self.ortho_init,
+        }
 
 
 class CnnPolicy(SACAuxPolicy):
