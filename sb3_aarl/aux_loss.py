@@ -3,13 +3,14 @@
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import yaml
 
 OPERATORS = ("inner", "bilinear", "cosine", "mse", "n_mse")
 KINDS = "sar"  # state, action, reward: the token of kind KINDS[j] at offset i has index 3 * i + j
-# Guards the parser against a mistyped offset that would ask for a mask of millions of bits.
+# Guards against a mistyped number that would ask for a mask of millions of bits.
 LONGEST_HORIZON = 1000
 
 _TOKEN = re.compile(r"([sar])_(?:\{\s*t\s*(?:\+\s*([0-9]+)\s*)?\}|t\s*(?:\+\s*([0-9]+))?)")
@@ -55,7 +56,7 @@ class AuxLoss:
     offset i has index 3i, the action 3i + 1, the reward 3i + 2. The value is frozen, hashable and picklable;
     ``yaml.safe_dump`` writes it as the mapping of :meth:`to_dict`.
 
-    :param horizon: Number of agent steps k >= 1 that the sequence spans
+    :param horizon: Number of agent steps k that the sequence spans, from 1 to 1000
     :param source: 3k + 1 booleans, what the prediction is made from (at least one state, paper A.3)
     :param target: 3k + 1 booleans, what is predicted (not empty, paper A.3)
     :param operator: How far a prediction is from its target, one of ``OPERATORS`` (paper A.1.3)
@@ -70,9 +71,7 @@ class AuxLoss:
     negatives: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.horizon, bool) or int(self.horizon) != self.horizon or self.horizon < 1:
-            raise ValueError(f"horizon must be an integer of at least 1, not {self.horizon!r}")
-        object.__setattr__(self, "horizon", int(self.horizon))
+        object.__setattr__(self, "horizon", _checked_horizon(self.horizon))
         for name in ("source", "target"):
             mask = tuple(getattr(self, name))
             if len(mask) != 3 * self.horizon + 1:
@@ -82,6 +81,8 @@ class AuxLoss:
             object.__setattr__(self, name, tuple(bool(bit) for bit in mask))
         if self.operator not in OPERATORS:
             raise ValueError(f"unknown operator {self.operator!r}, expected one of {', '.join(OPERATORS)}")
+        if self.negatives not in (False, True):  # bool() would take the text "false" for true
+            raise ValueError(f"negatives must be a boolean, not {self.negatives!r}")
         object.__setattr__(self, "negatives", bool(self.negatives))
         if not any(self.source[::3]):
             named = ", ".join(map(str, self.source_tokens)) or "nothing"
@@ -109,9 +110,8 @@ class AuxLoss:
         """
         source, target = set(source), set(target)
         longest = max(source | target, key=lambda token: token.horizon, default=Token("s", 0))
-        if horizon is None:
-            horizon = longest.horizon
-        elif horizon < longest.horizon:
+        horizon = _checked_horizon(longest.horizon if horizon is None else horizon)
+        if horizon < longest.horizon:
             raise ValueError(f"{longest} needs a horizon of at least {longest.horizon}, not {horizon}")
         masks = [tuple(Token.of(i) in tokens for i in range(3 * horizon + 1)) for tokens in (source, target)]
         return cls(horizon, masks[0], masks[1], operator, negatives)
@@ -203,6 +203,12 @@ class AuxLoss:
 yaml.SafeDumper.add_representer(AuxLoss, lambda dumper, loss: dumper.represent_dict(loss.to_dict()))
 
 
+def _checked_horizon(horizon: Any) -> int:
+    if isinstance(horizon, bool) or not isinstance(horizon, Integral) or not 1 <= int(horizon) <= LONGEST_HORIZON:
+        raise ValueError(f"horizon must be an integer from 1 to {LONGEST_HORIZON}, not {horizon!r}")
+    return int(horizon)
+
+
 class _Parser:
     """Reads a notation from left to right; every error says where it stands."""
 
@@ -263,16 +269,18 @@ class _Parser:
         options: dict[str, Any] = {}
         for word in match[1].split(",") if match else []:
             word = word.strip()
+            option: dict[str, Any] = {}
             if word in OPERATORS:
-                options["operator"] = word
+                option = {"operator": word}
             elif word == "negatives":
-                options["negatives"] = True
+                option = {"negatives": True}
             elif re.fullmatch(r"horizon\s*=\s*[0-9]{1,4}", word):
-                options["horizon"] = int(word.partition("=")[2])
-            else:
+                option = {"horizon": int(word.partition("=")[2])}
+            if not option or option.keys() & options.keys():
                 assert match is not None
                 self.position = match.start()
-                raise self.fail(f"an operator, 'negatives' or 'horizon=k' instead of {word!r}")
+                raise self.fail(f"an operator, 'negatives' or 'horizon=k', each once only, instead of {word!r}")
+            options |= option
         return options
 
     def end(self) -> None:

@@ -1,0 +1,282 @@
+"""AuxLoss: notation, validity, canonical form and the size of the search space."""
+
+import dataclasses
+import pickle
+import re
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_aarl import AuxLoss, search_space_size
+from sb3_aarl.aux_loss import OPERATORS, Token
+
+
+@st.composite
+def losses(draw: st.DrawFn, max_horizon: int = 12) -> AuxLoss:
+    """Any valid loss."""
+    horizon = draw(st.integers(1, max_horizon))
+    bits = st.lists(st.booleans(), min_size=3 * horizon + 1, max_size=3 * horizon + 1)
+    source = draw(bits.filter(lambda mask: any(mask[::3])))
+    target = draw(bits.filter(any))
+    return AuxLoss(horizon, tuple(source), tuple(target), draw(st.sampled_from(OPERATORS)), draw(st.booleans()))
+
+
+def as_sets(loss: AuxLoss) -> tuple[set[tuple[str, int]], set[tuple[str, int]]]:
+    """Source and target as sets of (kind, offset), read from the bits alone."""
+    source, target = ({("sar"[i % 3], i // 3) for i, bit in enumerate(mask) if bit} for mask in (loss.source, loss.target))
+    return source, target
+
+
+def smallest_horizon(tokens: set[tuple[str, int]]) -> int:
+    return max([1] + [offset if kind == "s" else offset + 1 for kind, offset in tokens])
+
+
+@given(losses())
+def test_notation_round_trip(loss: AuxLoss) -> None:
+    assert AuxLoss.parse(str(loss)) == loss
+    assert AuxLoss.parse(loss.latex(), loss.operator, loss.negatives, loss.horizon) == loss
+    # What is said twice alike is no contradiction.
+    assert AuxLoss.parse(str(loss), loss.operator, loss.negatives, loss.horizon) == loss
+
+
+@given(losses())
+def test_latex_is_in_the_papers_form(loss: AuxLoss) -> None:
+    token = r"[sar]_(t|\{t\+[1-9][0-9]*\})"
+    tokens = rf"\\\{{({token}(, {token})*)\\\}}"
+    assert re.fullmatch(rf"{tokens} \\rightarrow {tokens}", loss.latex())
+
+
+@given(losses())
+def test_value_semantics(loss: AuxLoss) -> None:
+    twin = AuxLoss(loss.horizon, list(loss.source), list(loss.target), loss.operator, loss.negatives)  # type: ignore[arg-type]
+    assert twin == loss and hash(twin) == hash(loss) and len({twin, loss}) == 1
+    assert pickle.loads(pickle.dumps(loss)) == loss
+    assert AuxLoss.from_dict(loss.to_dict()) == loss
+    text = yaml.safe_dump({"aux_loss": loss})
+    assert AuxLoss.from_dict(yaml.safe_load(text)["aux_loss"]) == loss
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        loss.horizon = 1  # type: ignore[misc]
+    for field, value in (("negatives", not loss.negatives), ("operator", "mse" if loss.operator != "mse" else "inner")):
+        assert dataclasses.replace(loss, **{field: value}) != loss
+
+
+@given(losses())
+def test_tokens_are_the_bits_of_the_masks(loss: AuxLoss) -> None:
+    source, target = as_sets(loss)
+    assert set(loss.source_tokens) == source and set(loss.target_tokens) == target
+    for tokens in (loss.source_tokens, loss.target_tokens):
+        assert [token.index for token in tokens] == sorted(token.index for token in tokens)
+        assert all(Token.of(token.index) == token for token in tokens)
+    longer = AuxLoss.from_tokens(loss.source_tokens, loss.target_tokens, loss.operator, loss.negatives, loss.horizon)
+    assert longer == loss
+    shortest = AuxLoss.from_tokens(loss.source_tokens, loss.target_tokens)
+    assert shortest.horizon == smallest_horizon(source | target) <= loss.horizon
+
+
+@given(losses())
+def test_canonical_against_sets(loss: AuxLoss) -> None:
+    source, target = as_sets(loss)
+    start = min(offset for _, offset in source | target)
+    shifted = [{(kind, offset - start) for kind, offset in tokens} for tokens in (source, target)]
+    canonical = loss.canonical()
+    assert as_sets(canonical) == tuple(shifted)
+    assert canonical.horizon == smallest_horizon(shifted[0] | shifted[1])
+    assert (canonical.operator, canonical.negatives) == (loss.operator, loss.negatives)
+    assert canonical.canonical() == canonical
+
+
+@given(losses(max_horizon=6), st.integers(0, 5), st.integers(0, 3))
+def test_losses_equal_up_to_a_shift_have_one_canonical_form(loss: AuxLoss, shift: int, unused: int) -> None:
+    pads = (False,) * (3 * shift), (False,) * (3 * unused)
+    source, target = (pads[0] + mask + pads[1] for mask in (loss.source, loss.target))
+    moved = AuxLoss(loss.horizon + shift + unused, source, target, loss.operator, loss.negatives)
+    assert moved.canonical() == loss.canonical()
+
+
+@given(losses(max_horizon=2), losses(max_horizon=2))
+def test_losses_that_differ_by_more_have_different_canonical_forms(one: AuxLoss, other: AuxLoss) -> None:
+    def shifts(loss: AuxLoss) -> list[tuple[set[tuple[str, int]], ...]]:
+        return [tuple({(kind, i + by) for kind, i in tokens} for tokens in as_sets(loss)) for by in range(-3, 4)]
+
+    same = as_sets(other) in shifts(one) and (one.operator, one.negatives) == (other.operator, other.negatives)
+    assert (one.canonical() == other.canonical()) == same
+
+
+def test_masks_that_are_typed_out() -> None:
+    # s_t a_t r_t s_t+1 a_t+1 r_t+1 s_t+2
+    source = (True, True, False, False, False, False, False)
+    target = (False, False, False, False, False, True, True)
+    loss = AuxLoss(2, source, target, "cosine", True)
+    assert str(loss) == "{s_t, a_t} -> {r_t+1, s_t+2} [cosine, negatives]"
+    assert loss.latex() == r"\{s_t, a_t\} \rightarrow \{r_{t+1}, s_{t+2}\}"
+    assert loss.to_dict() == {
+        "loss": "{s_t, a_t} -> {r_t+1, s_t+2}",
+        "horizon": 2,
+        "operator": "cosine",
+        "negatives": True,
+    }
+    assert AuxLoss.parse("{s_t, a_t} -> {r_t+1, s_t+2}") == AuxLoss(2, source, target)
+    assert str(AuxLoss(2, (True,) + (False,) * 6, (True,) + (False,) * 6)) == "{s_t} -> {s_t} [horizon=2]"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{s_t, a_t}->{s_t+1}",
+        "  { a_t ,s_t }  ->  { s_t + 1 }  ",
+        "{s_t, a_t} → {s_{t+1}}",
+        r"\{s_t, a_t\} \rightarrow \{s_{t+1}\}",
+        r"$\{s_{t}, a_t\} \to \{s_{ t + 1 }\}$",
+        r"$\{s_t, a_t\}$ \rightarrow $\{s_{t+1}\}$",
+        r"$$\{s_t,a_{t+0}\}\rightarrow\{s_{t+01}\}$$",
+        "{s_t, a_t} -> {s_t+1} [mse]",
+        "{s_t, a_t} -> {s_t+1} [horizon = 1]",
+    ],
+)
+def test_ways_to_write_forward_dynamics(text: str) -> None:
+    assert AuxLoss.parse(text) == AuxLoss(1, (True, True, False, False), (False, False, False, True))
+
+
+def test_arguments_and_brackets() -> None:
+    text = "{s_t} -> {s_t}"
+    assert AuxLoss.parse(text, "inner", True, 3) == AuxLoss.parse(f"{text} [negatives, horizon=3, inner]")
+    assert AuxLoss.parse(f"{text} [n_mse]", negatives=True, horizon=2) == AuxLoss.parse(text, "n_mse", True, 2)
+    with pytest.raises(ValueError, match=r"operator is 'inner', but the notation says 'cosine'"):
+        AuxLoss.parse(f"{text} [cosine]", "inner")
+    with pytest.raises(ValueError, match=r"horizon is 2, but the notation says 3"):
+        AuxLoss.parse(f"{text} [horizon=3]", horizon=2)
+
+
+@pytest.mark.parametrize(
+    "text, position, expected",
+    [
+        ("", 0, "'{'"),
+        ("s_t -> s_t+1", 0, "'{'"),
+        ("   (s_t)", 3, "'{'"),
+        ("{x_t} -> {s_t}", 1, "a token"),
+        ("{s_t, } -> {s_t}", 6, "a token"),
+        ("{,s_t} -> {s_t}", 1, "a token"),
+        ("{s_t+} -> {s_t}", 4, "',' or '}'"),
+        ("{s_t1} -> {s_t}", 4, "',' or '}'"),
+        ("{s_{t+1} -> {s_t}", 9, "',' or '}'"),
+        ("{s_t a_t} -> {s_t}", 5, "',' or '}'"),
+        ("{s_t, s_{t+0}} -> {s_t}", 6, "s_t once only"),
+        ("{s_t} {s_t}", 6, "'->'"),
+        (r"{s_t} \top {s_t}", 6, "'->'"),
+        ("{s_t} -> ", 9, "'{'"),
+        ("{s_t} -> {s_t", 13, "',' or '}'"),
+        ("{s_t} -> {s_t} -> {s_t}", 15, "nothing more"),
+        ("{s_t} -> {s_t} [mse", 15, "nothing more"),
+        ("{s_t} -> {s_t} [huber]", 15, "an operator, .* instead of 'huber'"),
+        ("{s_t} -> {s_t} []", 15, "an operator, .* instead of ''"),
+        ("{s_t} -> {s_t} [mse, cosine]", 15, "an operator, .* each once only, instead of 'cosine'"),
+        ("{s_t} -> {s_t} [horizon=5, horizon=6]", 15, "an operator, .* each once only, instead of 'horizon=6'"),
+        ("{s_t} -> {s_t+1001}", 10, "an offset of at most 1000"),
+        ("{s_t} -> {s_t+" + "9" * 5000 + "}", 10, "an offset of at most 1000"),
+    ],
+)
+def test_what_cannot_be_read_says_where(text: str, position: int, expected: str) -> None:
+    with pytest.raises(ValueError, match=rf"^expected {expected}.* at position {position}, found ") as error:
+        AuxLoss.parse(text)
+    found = repr(text[position : position + 10]) if position < len(text) else "the end"
+    assert f"found {found}: " in str(error.value)
+
+
+@pytest.mark.parametrize("text", [None, 7, b"{s_t} -> {s_t}", ["{s_t} -> {s_t}"]])
+def test_a_notation_is_text(text: object) -> None:
+    with pytest.raises(ValueError, match="a notation is a string"):
+        AuxLoss.parse(text)  # type: ignore[arg-type]
+
+
+YES, NO = (True, False, False, False), (False,) * 4
+
+
+@pytest.mark.parametrize(
+    "arguments, rule",
+    [
+        ((1, (False, True, True, False), YES), r"source needs at least one state.* it has a_t, r_t$"),
+        ((1, NO, YES), r"source needs at least one state.* it has nothing$"),
+        ((1, YES, NO), "target is empty"),
+        ((1, YES[:3], YES), "source has 3 bits, but horizon 1 has 4 tokens"),
+        ((2, (*YES, *NO[:3]), YES), "target has 4 bits, but horizon 2 has 7 tokens"),
+        ((1, YES, (0, 2, 0, 0)), "target must be booleans"),
+        ((0, (True,), (True,)), "horizon must be an integer from 1 to 1000, not 0"),
+        ((True, YES, YES), "horizon must be an integer .* not True"),
+        ((None, YES, YES), "horizon must be an integer .* not None"),
+        ((1.5, YES, YES), "horizon must be an integer .* not 1.5"),
+        ((1001, (True,) * 3004, (True,) * 3004), "horizon must be an integer from 1 to 1000, not 1001"),
+        ((1, YES, YES, "huber"), "unknown operator 'huber', expected one of inner, bilinear, cosine, mse, n_mse"),
+        ((1, YES, YES, "mse", "false"), "negatives must be a boolean, not 'false'"),
+    ],
+)
+def test_an_invalid_loss_names_the_rule(arguments: tuple, rule: str) -> None:
+    with pytest.raises(ValueError, match=rule):
+        AuxLoss(*arguments)
+
+
+@pytest.mark.parametrize(
+    "text, horizon, rule",
+    [
+        ("{a_t, r_t} -> {s_t+1}", None, r"it has a_t, r_t$"),
+        ("{} -> {s_t}", None, "it has nothing$"),
+        ("{s_t} -> {}", None, "target is empty"),
+        ("{s_t} -> {a_t+2}", 2, r"a_t\+2 needs a horizon of at least 3, not 2"),
+        ("{s_t} -> {s_t+3}", 2, r"s_t\+3 needs a horizon of at least 3, not 2"),
+        ("{s_t} -> {a_t+1000}", None, "from 1 to 1000, not 1001"),
+        ("{s_t} -> {s_t}", "two", "horizon must be an integer .* not 'two'"),
+        ("{s_t} -> {s_t} [horizon=0]", None, "horizon must be an integer .* not 0"),
+    ],
+)
+def test_a_readable_loss_that_is_invalid(text: str, horizon: int | None, rule: str) -> None:
+    with pytest.raises(ValueError, match=rule):
+        AuxLoss.parse(text, horizon=horizon)
+
+
+@pytest.mark.parametrize(
+    "values, problem",
+    [
+        ({"loss": "{s_t} -> {s_t}", "operater": "mse"}, "unknown key 'operater'"),
+        ({"operator": "mse"}, "no notation under 'loss'"),
+        ({"loss": 3}, "no notation under 'loss'"),
+        ({"loss": "{s_t} -> {s_t}", "operator": ["mse"]}, "unknown operator"),
+        ({"loss": "{s_t} -> {s_t}", "negatives": "no"}, "negatives must be a boolean"),
+    ],
+)
+def test_bad_mappings(values: dict, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        AuxLoss.from_dict(values)
+
+
+FRAGMENTS = ["{", "}", r"\{", r"\}", "->", r"\rightarrow", "s_t", "a_t", "r_{t+1}", "s_t+2", "+", "1", ",", " ", "$", "[", "]"]
+FRAGMENTS += ["mse", "bilinear", "negatives", "horizon=3", "horizon=", "{s_t", "{s_t} -> {s_t+1}", "²", "\x00", "٣"]
+
+
+@given(
+    st.one_of(
+        st.text(),
+        st.lists(st.sampled_from(FRAGMENTS)).map("".join),
+        losses()
+        .map(str)
+        .flatmap(
+            lambda text: st.tuples(st.integers(0, len(text)), st.integers(0, 3), st.text(max_size=3)).map(
+                lambda edit: text[: edit[0]] + edit[2] + text[edit[0] + edit[1] :]
+            )
+        ),
+    )
+)
+def test_any_text_is_a_loss_or_a_value_error(text: str) -> None:
+    try:
+        loss = AuxLoss.parse(text)
+    except ValueError as error:
+        assert str(error)
+    else:
+        assert AuxLoss.parse(str(loss)) == loss
+
+
+def test_search_space_size() -> None:
+    # Appendix C, 10 * (2^8 + 2^14 + ... + 2^62), worked out as a geometric series; the paper rounds it down to 4.6e19.
+    assert search_space_size() == search_space_size(10) == 2560 * (64**10 - 1) // 63 == 46848873837992512000
+    assert isinstance(search_space_size(10), int)
+    assert search_space_size(1) == 2560

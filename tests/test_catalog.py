@@ -1,0 +1,235 @@
+"""The catalogue against the paper: table 1, appendix D.1 and the candidates of tables 9, 12, 13 and 14."""
+
+import re
+from collections import Counter
+
+import pytest
+
+from sb3_aarl import AuxLoss, catalog
+
+SETS = tuple[set[str], set[str]]
+
+
+def as_sets(loss: AuxLoss) -> SETS:
+    """Source and target as sets such as ``{"s0", "a3"}``, read from the bits alone."""
+    source, target = ({f"{'sar'[i % 3]}{i // 3}" for i, bit in enumerate(mask) if bit} for mask in (loss.source, loss.target))
+    return source, target
+
+
+def read_latex(line: str) -> SETS:
+    """The paper's own print of a candidate, by a pattern that knows nothing of AuxLoss."""
+    source, target = (
+        {kind + (offset or "0") for kind, offset in re.findall(r"([sar])_(?:t|\{t\+(\d+)\})", part)}
+        for part in line.split(r"\rightarrow")
+    )
+    return source, target
+
+
+@pytest.mark.parametrize(
+    "name, horizon, source, target, operator, negatives",
+    [
+        ("forward-dynamics", 1, "s0 a0", "s1", "mse", False),
+        ("inverse-dynamics", 1, "a0 s1", "s0", "mse", False),
+        ("reward-prediction", 1, "s0 a0", "r0", "mse", False),
+        ("action-inference", 1, "s0 s1", "a0", "mse", False),
+        ("curl", 1, "s0", "s0", "bilinear", True),
+        ("aarl-pixel", 4, "s1 a1 a2 a3", "r0 r1 s2 s3", "mse", False),
+        ("aarl-state", 9, "s0 a0 a1 s2 a2 a3 r3 a4 r4 a5 a7 s8 a8 r8", "s1 s3 a4 s6 s9", "mse", False),
+        ("spr-1", 1, "s0 a0", "s1", "n_mse", False),
+        ("spr-3", 3, "s0 a0 a1 a2", "s1 s2 s3", "n_mse", False),
+        ("spr-10", 10, "s0 a0 a1 a2 a3 a4 a5 a6 a7 a8 a9", "s1 s2 s3 s4 s5 s6 s7 s8 s9 s10", "n_mse", False),
+        ("atc-1", 1, "s0", "s1", "bilinear", True),
+        ("atc-4", 4, "s0", "s1 s2 s3 s4", "bilinear", True),
+        ("atc-10", 10, "s0", "s1 s2 s3 s4 s5 s6 s7 s8 s9 s10", "bilinear", True),
+    ],
+)
+def test_named_losses(name: str, horizon: int, source: str, target: str, operator: str, negatives: bool) -> None:
+    loss = catalog.load(name)
+    assert as_sets(loss) == (set(source.split()), set(target.split()))
+    assert (loss.horizon, loss.operator, loss.negatives) == (horizon, operator, negatives)
+    assert catalog.resolve(name) == loss
+
+
+def test_names() -> None:
+    names = catalog.names()
+    assert len(names) == len(set(names)) == 27
+    assert names[:3] == ["aarl-pixel", "aarl-state", "action-inference"]
+    for family in ("atc", "spr"):
+        assert [name for name in names if name.startswith(family)] == [f"{family}-{k}" for k in range(1, 11)]
+    assert all(catalog.load(name) == catalog.load(name).canonical() for name in names)
+    for k in range(1, 11):
+        for name, operator in ((f"atc-{k}", "bilinear"), (f"spr-{k}", "n_mse")):
+            loss = catalog.load(name)
+            assert (loss.horizon, loss.operator, loss.negatives) == (k, operator, operator == "bilinear")
+            assert as_sets(loss)[1] == {f"s{i}" for i in range(1, k + 1)}
+
+
+@pytest.mark.parametrize(
+    "name, nearest",
+    [
+        ("crul", "curl"),
+        ("forward-dynamic", "forward-dynamics"),
+        ("aarl_pixel", "aarl-pixel"),
+        ("spr-11", "spr-1"),
+        ("atc", "atc-"),
+        ("qqqq", "known: aarl-pixel, "),
+    ],
+)
+@pytest.mark.parametrize("look_up", [catalog.load, catalog.resolve])
+def test_unknown_names_list_the_nearest(name: str, nearest: str, look_up) -> None:
+    with pytest.raises(ValueError, match=f"unknown auxiliary loss '{name}'") as error:
+        look_up(name)
+    assert nearest in str(error.value).partition(", ")[2]
+
+
+def test_resolve() -> None:
+    loss = AuxLoss.parse("{s_t} -> {s_t+1} [cosine, negatives]")
+    for value in (loss, str(loss), loss.to_dict(), {"loss": str(loss)}):
+        assert catalog.resolve(value) == loss
+    with pytest.raises(ValueError, match="at position 0"):
+        catalog.resolve("s_t -> s_t+1")
+    with pytest.raises(ValueError, match="not 3"):
+        catalog.resolve(3)  # type: ignore[arg-type]
+
+
+def test_shape_of_the_published_tables() -> None:
+    published = catalog.published()
+    assert Counter(entry.table for entry in published) == {9: 35, 12: 35, 13: 29, 14: 25}
+    tables = {
+        9: ("Cheetah-Run", "pixel", [5] * 7),
+        12: ("Cheetah-Run", "state", [5] * 7),
+        13: ("Hopper-Hop", "state", [5, 5, 4, 5, 5, 5]),
+        14: ("Quadruped-Run", "state", [5] * 5),
+    }
+    expected = [
+        (table, environment, observation, stage, rank)
+        for table, (environment, observation, places) in tables.items()
+        for stage, ranks in enumerate(places, start=1)
+        for rank in range(1, ranks + 1)
+    ]
+    assert [entry[1:] for entry in published] == expected
+    for entry in published:
+        # Table 2's choice for all of them; the paper prints each from t on with the horizon left to the reader.
+        assert (entry.loss.operator, entry.loss.negatives) == ("mse", False)
+        assert entry.loss == entry.loss.canonical()
+
+
+# Copied from the paper, two candidates of every stage: table, stage, rank and what it prints.
+PRINTED = r"""
+9 1 2 \{s_t, a_t, r_t\}
+  \rightarrow \{s_{t+1}\}
+9 1 5 \{s_t, a_t, s_{t+1}, a_{t+1}, s_{t+2}, r_{t+2}\}
+  \rightarrow \{s_t, s_{t+1}, r_{t+1}, s_{t+2}, r_{t+2}, s_{t+3}\}
+9 2 2 \{s_t, a_t, a_{t+2}, r_{t+2}\}
+  \rightarrow \{s_t, r_t, s_{t+1}, s_{t+2}, r_{t+2}\}
+9 2 5 \{r_t, s_{t+1}, r_{t+1}\}
+  \rightarrow \{s_t, a_t, a_{t+1}, s_{t+2}\}
+9 3 1 \{s_t, a_t, a_{t+2}, r_{t+2}\}
+  \rightarrow \{s_t, s_{t+1}, s_{t+2}, r_{t+2}\}
+9 3 5 \{r_t, s_{t+1}\}
+  \rightarrow \{s_t, a_t, a_{t+1}, s_{t+2}\}
+9 4 2 \{s_t, a_t, a_{t+1}, r_{t+1}, r_{t+2}, s_{t+3}, a_{t+3}\}
+  \rightarrow \{s_{t+1}, s_{t+2}, r_{t+3}, s_{t+4}\}
+9 4 5 \{r_t, s_{t+1}, a_{t+1}\}
+  \rightarrow \{s_t, a_t, a_{t+1}, s_{t+2}\}
+9 5 3 \{s_{t+1}, a_{t+1}, a_{t+2}, a_{t+3}\}
+  \rightarrow \{r_t, r_{t+1}, s_{t+2}, s_{t+3}\}
+9 5 4 \{s_t\}
+  \rightarrow \{s_t, r_t, s_{t+1}, r_{t+1}, s_{t+2}\}
+9 6 2 \{s_t, a_{t+1}, a_{t+3}, s_{t+4}, r_{t+4}\}
+  \rightarrow \{s_{t+1}, s_{t+2}, a_{t+3}, s_{t+4}, a_{t+4}, s_{t+5}\}
+9 6 5 \{s_t, a_{t+1}, a_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, s_{t+4}, r_{t+4}\}
+  \rightarrow \{s_{t+1}, a_{t+1}, s_{t+2}, r_{t+2}, s_{t+4}, a_{t+4}, r_{t+4}, s_{t+5}\}
+9 7 2 \{s_t, r_{t+2}, a_{t+3}, s_{t+4}\}
+  \rightarrow \{a_t, s_{t+1}, s_{t+2}, r_{t+2}, a_{t+3}, r_{t+3}, s_{t+4}, a_{t+4}, r_{t+4}, s_{t+5}\}
+9 7 5 \{s_t, a_{t+1}, r_{t+2}, a_{t+3}, s_{t+4}, r_{t+4}\}
+  \rightarrow \{s_{t+1}, s_{t+2}, r_{t+2}, a_{t+3}, s_{t+4}, a_{t+4}, s_{t+5}, a_{t+5}\}
+12 1 1 \{s_t, a_t, r_t, a_{t+1}, r_{t+1}\}
+  \rightarrow \{s_{t+1}, s_{t+2}\}
+12 1 2 \{a_t, r_t, s_{t+2}, a_{t+2}, a_{t+3}, r_{t+3}\}
+  \rightarrow \{s_t, s_{t+1}, a_{t+1}, s_{t+3}, s_{t+4}\}
+12 2 1 \{s_t, a_t, r_t, a_{t+1}, r_{t+1}\}
+  \rightarrow \{s_{t+1}, s_{t+2}\}
+12 2 5 \{s_t, a_t, r_t\}
+  \rightarrow \{r_t, s_{t+1}\}
+12 3 1 \{s_t, a_t, r_t, a_{t+1}, r_{t+1}\}
+  \rightarrow \{s_{t+1}\}
+12 3 5 \{s_t, a_t, a_{t+1}, r_{t+1}\}
+  \rightarrow \{s_t, s_{t+1}, s_{t+2}\}
+12 4 3 \{s_t, a_t, a_{t+1}, a_{t+2}, r_{t+2}, r_{t+3}, a_{t+4}, r_{t+4}, a_{t+5}, a_{t+6}, a_{t+7}, a_{t+8}, r_{t+8}\}
+  \rightarrow \{a_t, s_{t+1}, s_{t+2}, a_{t+2}, s_{t+3}, s_{t+4}, s_{t+6}, a_{t+8}, s_{t+9}\}
+12 4 4 \{s_t, a_t, a_{t+1}, s_{t+2}, a_{t+2}, a_{t+3}, r_{t+3}, a_{t+4}, r_{t+4}, a_{t+5}, a_{t+7}, s_{t+8}, a_{t+8}, r_{t+8}\}
+  \rightarrow \{s_{t+1}, s_{t+3}, a_{t+4}, s_{t+6}, s_{t+9}\}
+12 5 1 \{s_t, a_t, r_t, a_{t+1}\}
+  \rightarrow \{s_{t+1}, r_{t+1}\}
+12 5 5 \{s_t, a_t, r_t, a_{t+1}\}
+  \rightarrow \{s_{t+1}, s_{t+2}\}
+12 6 4 \{s_t, a_t, r_t, a_{t+1}\}
+  \rightarrow \{s_{t+1}, s_{t+2}\}
+12 6 5 \{s_t, a_t, r_t, a_{t+1}\}
+  \rightarrow \{s_{t+1}, s_{t+2}\}
+12 7 1 \{s_t, a_t, r_t, a_{t+1}, r_{t+1}\}
+  \rightarrow \{s_{t+1}, s_{t+2}\}
+12 7 4 \{s_t, a_t, a_{t+1}\}
+  \rightarrow \{s_{t+1}, a_{t+1}, s_{t+2}\}
+13 1 1 \{s_t, a_t\}
+  \rightarrow \{r_t, s_{t+1}\}
+13 1 5 \{s_t, r_t\}
+  \rightarrow \{s_t, r_t, s_{t+1}\}
+13 2 1 \{s_t, a_t, s_{t+1}, a_{t+1}\}
+  \rightarrow \{s_{t+1}, s_{t+2}\}
+13 2 2 \{s_t, a_t, r_t, s_{t+2}, r_{t+2}\}
+  \rightarrow \{r_{t+1}, s_{t+2}, a_{t+2}, s_{t+3}\}
+13 3 1 \{s_t\}
+  \rightarrow \{s_t, a_t, r_t, s_{t+1}\}
+13 3 4 \{s_t, a_t, a_{t+1}\}
+  \rightarrow \{s_t, s_{t+1}, s_{t+2}\}
+13 4 2 \{s_t, a_t, s_{t+1}, a_{t+1}\}
+  \rightarrow \{s_{t+2}\}
+13 4 4 \{s_t, a_{t+1}, s_{t+2}, a_{t+2}, r_{t+2}\}
+  \rightarrow \{s_{t+1}, r_{t+1}, a_{t+2}, s_{t+3}\}
+13 5 2 \{s_t, a_{t+1}, r_{t+1}, s_{t+2}, a_{t+2}, r_{t+2}\}
+  \rightarrow \{s_t, r_{t+1}, s_{t+2}, a_{t+2}, s_{t+3}\}
+13 5 4 \{s_t, r_t, a_{t+1}, s_{t+2}, r_{t+2}\}
+  \rightarrow \{s_{t+1}, a_{t+2}, s_{t+3}\}
+13 6 2 \{s_t, r_t, s_{t+2}, a_{t+2}, r_{t+2}\}
+  \rightarrow \{s_t, s_{t+1}, s_{t+2}, s_{t+3}\}
+13 6 4 \{s_t, a_t, r_t, s_{t+1}, a_{t+1}, r_{t+1}\}
+  \rightarrow \{r_t, s_{t+1}, s_{t+2}\}
+14 1 1 \{a_t, r_t, s_{t+1}, s_{t+2}, a_{t+2}\}
+  \rightarrow \{s_t, a_{t+1}, s_{t+3}\}
+14 1 3 \{a_t, a_{t+1}, r_{t+1}, s_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}\}
+  \rightarrow \{s_t, s_{t+1}, a_{t+2}, s_{t+4}\}
+14 2 1 \{a_t, r_t, a_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, a_{t+4}\}
+  \rightarrow \{s_t, s_{t+1}, a_{t+1}, s_{t+2}, s_{t+4}, s_{t+5}\}
+14 2 3 \{a_{t+1}, r_{t+1}, s_{t+2}, a_{t+3}, r_{t+3}\}
+  \rightarrow \{s_t, a_t, r_t, a_{t+1}, a_{t+3}, s_{t+4}\}
+14 3 3 \{a_t, r_t, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, r_{t+4}\}
+  \rightarrow \{s_t, s_{t+1}, a_{t+1}, s_{t+2}, a_{t+2}, a_{t+3}, s_{t+4}, s_{t+5}\}
+14 3 5 \{s_t, a_t, r_t, r_{t+1}, a_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, s_{t+4}, s_{t+5}\}
+  \rightarrow \{a_t, a_{t+1}, r_{t+1}, a_{t+2}, r_{t+3}\}
+14 4 1 \{r_t, r_{t+1}, a_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, s_{t+4}, s_{t+5}\}
+  \rightarrow \{a_{t+2}, r_{t+3}, a_{t+4}\}
+14 4 3 \{a_t, a_{t+1}, a_{t+3}, r_{t+3}, s_{t+4}\}
+  \rightarrow \{s_{t+1}, r_{t+1}, s_{t+2}, a_{t+2}, r_{t+2}, s_{t+3}\}
+14 5 1 \{a_{t+1}, r_{t+1}, s_{t+2}, a_{t+2}, r_{t+2}, a_{t+3}, r_{t+3}\}
+  \rightarrow \{s_t, a_t, r_t, a_{t+1}, r_{t+1}, a_{t+2}, s_{t+3}, a_{t+3}\}
+14 5 5 \{s_t, a_t, r_t, r_{t+1}, a_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, s_{t+5}\}
+  \rightarrow \{a_t, a_{t+2}, r_{t+3}, a_{t+4}\}
+"""
+
+
+@pytest.mark.parametrize("entry", PRINTED.replace("\n ", "").strip().splitlines())
+def test_published_losses_are_the_papers(entry: str) -> None:
+    *place, printed = entry.split(maxsplit=3)
+    table, stage, rank = map(int, place)
+    (loss,) = (p.loss for p in catalog.published() if (p.table, p.stage, p.rank) == (table, stage, rank))
+    assert as_sets(loss) == read_latex(printed)
+    assert loss.latex() == printed
+
+
+def test_the_two_chosen_losses_are_published_candidates() -> None:
+    # Appendix D.1 calls AARL-Pixel a candidate of stage 4, but table 9 marks the one of stage 5.
+    places = {"aarl-pixel": (9, 5, 3), "aarl-state": (12, 4, 4)}
+    for name, place in places.items():
+        assert [(p.table, p.stage, p.rank) for p in catalog.published() if p.loss == catalog.load(name)] == [place]
