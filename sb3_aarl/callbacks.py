@@ -1,0 +1,167 @@
+"""Learning curve at fixed environment steps, and the area under it (AULC)."""
+
+import csv
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
+
+
+class Evaluation(NamedTuple):
+    """
+    One point of a learning curve.
+
+    :param environment_steps: Simulator steps that were trained (agent steps x action repeat)
+    :param mean: Mean return of the episodes
+    :param std: Standard deviation of their returns
+    :param episodes: Number of episodes
+    :param seconds: Wall time since training began, evaluations included
+    """
+
+    environment_steps: int
+    mean: float
+    std: float
+    episodes: int
+    seconds: float
+
+
+def aulc(curve: Sequence[Evaluation]) -> float:
+    """
+    Area under the learning curve as the paper approximates it (figure 4): the mean return over all evaluations.
+
+    :param curve: Evaluations at equally spaced steps
+    """
+    return float(np.mean([evaluation.mean for evaluation in curve]))
+
+
+class LearningCurveCallback(BaseCallback):
+    """
+    Evaluate with deterministic actions at fixed environment steps (paper, A.2: 10 episodes).
+
+    Evaluation k starts from initial states that only ``seed`` and k decide, so that runs can be compared and a resumed
+    run draws the same ones. The last checkpoint may be the end of training.
+
+    :param eval_env: Environment to evaluate on, not the one that is trained on
+    :param checkpoints: Environment steps (agent steps x action repeat) at which to evaluate, ascending
+    :param n_eval_episodes: Episodes of each evaluation
+    :param action_repeat: Environment steps of one agent step, None to ask the environment's wrappers
+    :param seed: Seed of the initial states
+    :param path: CSV file that the curve is written to after every evaluation, None for no file
+    :param on_evaluation: Called after each evaluation; training stops if it returns False
+    :param curve: Evaluations that were made before, of a run that goes on
+    :param verbose: 1 prints each evaluation
+    :raises ValueError: when the checkpoints are not ascending, or lie between two agent steps
+    """
+
+    def __init__(
+        self,
+        eval_env: gym.Env | VecEnv,
+        checkpoints: Sequence[int],
+        n_eval_episodes: int = 10,
+        action_repeat: int | None = None,
+        seed: int = 0,
+        path: str | Path | None = None,
+        on_evaluation: Callable[[Evaluation], bool | None] | None = None,
+        curve: Sequence[Evaluation] = (),
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        if not isinstance(eval_env, VecEnv):
+            env = eval_env if is_wrapped(eval_env, Monitor) else Monitor(eval_env)
+            eval_env = DummyVecEnv([lambda: env])
+        self.eval_env = eval_env
+        if action_repeat is None:
+            action_repeat = int(eval_env.get_attr("num_repeats")[0]) if eval_env.has_attr("num_repeats") else 1
+        self.action_repeat = action_repeat
+        self.checkpoints = list(checkpoints)
+        if not self.checkpoints or sorted({*self.checkpoints}) != self.checkpoints or self.checkpoints[0] < 1:
+            raise ValueError(f"checkpoints must be positive environment steps in ascending order, not {self.checkpoints}")
+        for checkpoint in self.checkpoints:
+            if checkpoint % action_repeat:
+                raise ValueError(f"checkpoint {checkpoint} is no multiple of the action repeat {action_repeat}")
+        if n_eval_episodes < 1:
+            raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
+        self.n_eval_episodes = n_eval_episodes
+        self.seed = seed
+        self.path = None if path is None else Path(path)
+        self.on_evaluation = on_evaluation
+        self.curve = list(curve)
+        self._seconds_before = self.curve[-1].seconds if self.curve else 0.0
+
+    def _on_training_start(self) -> None:
+        self._started = time.monotonic()
+
+    def _on_step(self) -> bool:
+        # With several environments, or a resumed run, one step may pass more than one checkpoint.
+        goes_on = True
+        while goes_on and self._is_due():
+            goes_on = self._evaluate()
+        return goes_on
+
+    def _is_due(self) -> bool:
+        n = len(self.curve)
+        return n < len(self.checkpoints) and self.num_timesteps * self.action_repeat >= self.checkpoints[n]
+
+    def _evaluate(self) -> bool:
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+        # Far apart, as environment i of a VecEnv takes seed + i.
+        self.eval_env.seed(self.seed + 1000 * len(self.curve))
+        returns, _ = evaluate_policy(self.model, self.eval_env, self.n_eval_episodes, return_episode_rewards=True)
+        assert isinstance(returns, list)
+        evaluation = Evaluation(
+            environment_steps=self.checkpoints[len(self.curve)],
+            mean=float(np.mean(returns)),
+            std=float(np.std(returns)),
+            episodes=len(returns),
+            seconds=round(self._seconds_before + time.monotonic() - self._started, 3),
+        )
+        self.curve.append(evaluation)
+        if self.path is not None:
+            write_curve(self.path, self.curve)
+        self.logger.record("eval/mean_reward", evaluation.mean)
+        self.logger.record("eval/environment_steps", evaluation.environment_steps)
+        if self.verbose:
+            print(f"{evaluation.environment_steps:>9,} environment steps: {evaluation.mean:7.1f} +- {evaluation.std:.1f}")
+        return self.on_evaluation is None or self.on_evaluation(evaluation) is not False
+
+    @property
+    def aulc(self) -> float:
+        """Area under the learning curve so far."""
+        return aulc(self.curve)
+
+
+def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:
+    """
+    Write a learning curve as CSV, one evaluation a line; an old file is replaced in one step.
+
+    :param path: The file; its folder is made if it is not there
+    :param curve: The evaluations
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.name}.tmp")
+    with unfinished.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(Evaluation._fields)
+        writer.writerows(curve)
+    unfinished.replace(path)
+
+
+def read_curve(path: str | Path) -> list[Evaluation]:
+    """
+    Read what :func:`write_curve` wrote.
+
+    :param path: The file
+    """
+    with Path(path).open(newline="", encoding="utf-8") as file:
+        types = (int, float, float, int, float)
+        rows = list(csv.reader(file))[1:]
+        return [Evaluation(*(convert(cell) for convert, cell in zip(types, row, strict=True))) for row in rows]

@@ -1,0 +1,171 @@
+"""Environments: DeepMind Control through shimmy, as vectors or pixels, out of Gymnasium's own wrappers."""
+
+import contextlib
+import ctypes
+import difflib
+import os
+import sys
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import (
+    AddRenderObservation,
+    FlattenObservation,
+    FrameStackObservation,
+    ReshapeObservation,
+    TimeLimit,
+    TransformAction,
+    TransformObservation,
+)
+
+
+def _choose_renderer() -> None:
+    """Without a display, set MUJOCO_GL to what can render without one: MuJoCo reads it when it is imported."""
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if "MUJOCO_GL" in os.environ or display or not sys.platform.startswith("linux"):
+        return
+    for backend, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8")):
+        with contextlib.suppress(OSError):
+            ctypes.CDLL(library)
+            os.environ["MUJOCO_GL"] = backend
+            return
+
+
+_choose_renderer()
+# PyTorch's CUDA build imports triton at the first optimizer step. If Mesa is loaded by then, as it is with EGL in
+# software, the two copies of LLVM crash the process; in this order they do not.
+with contextlib.suppress(ImportError):
+    import triton  # type: ignore[import-not-found]  # noqa: F401
+# Locomotion tasks need labmaze, which Python 3.13 has no wheel of: shimmy prints a warning at every import.
+with contextlib.redirect_stdout(None):
+    import shimmy  # noqa: F401  (registers dm_control/...)
+from dm_control import suite  # noqa: E402
+
+PREFIX = "dm_control/"
+# Simulator steps of an episode; only LQR has no time limit of its own.
+EPISODE_LENGTH = 1000
+# The camera that papers render a domain with, where it is not the first one (CURL, DrQ-v2: behind the quadruped).
+CAMERAS = {"quadruped": 2}
+
+
+class RepeatAction(gym.Wrapper):
+    """
+    Keep each action for several steps and sum their rewards. Gymnasium has the same from 1.3 on, which SB3 2.8 forbids.
+
+    :param env: The environment
+    :param num_repeats: Steps for which an action is kept; fewer where the episode ends
+    """
+
+    def __init__(self, env: gym.Env, num_repeats: int):
+        super().__init__(env)
+        self.num_repeats = num_repeats
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        total = 0.0
+        for _ in range(self.num_repeats):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            total += float(reward)
+            if terminated or truncated:
+                break
+        return observation, total, terminated, truncated, info
+
+
+def env_ids() -> list[str]:
+    """The ids of all tasks of the DeepMind Control Suite, such as ``dm_control/cheetah-run-v0``."""
+    return sorted(f"{PREFIX}{domain}-{task}-v0" for domain, task in suite.ALL_TASKS)
+
+
+def make_dmc_env(
+    env_id: str,
+    *,
+    pixels: bool = False,
+    action_repeat: int = 1,
+    frame_stack: int = 1,
+    image_size: int | tuple[int, int] = 100,
+    camera_id: int | str | None = None,
+    fast_rendering: bool = False,
+    seed: int | None = None,
+) -> gym.Env:
+    """
+    A task of the DeepMind Control Suite with one float32 vector, or with images, as observation.
+
+    ``env.reset(seed=s)`` makes all that follows repeatable. Rewards of repeated steps are summed; an episode has 1000
+    simulator steps ("environment steps" in the paper), so 1000 / action_repeat agent steps, and ends by truncation.
+
+    :param env_id: Such as ``dm_control/cheetah-run-v0``; ``cheetah-run`` will do
+    :param pixels: Whether to observe rendered images, (3 * frame_stack, height, width) bytes, instead of state vectors
+    :param action_repeat: Simulator steps for which each action is kept
+    :param frame_stack: Consecutive observations put side by side, the newest last; the first one of an episode fills up
+    :param image_size: Height and width in pixels, one number for both
+    :param camera_id: Number or name of the camera, None for the usual one of the domain
+    :param fast_rendering: Whether to leave out shadows, reflections and anti-aliasing: several times faster where
+        there is no GPU, but other pictures than the suite's own
+    :param seed: Seed of the initial states from the first ``reset()`` on, and of ``action_space``; None for a random one
+    :raises ValueError: for an unknown task, with the nearest ones
+    """
+    known = env_ids()
+    if env_id not in known:
+        full = f"{PREFIX}{env_id.removeprefix(PREFIX).removesuffix('-v0')}-v0"
+        if full not in known:
+            nearest = ", ".join(difflib.get_close_matches(full, known, cutoff=0.4)) or f"something like {known[0]}"
+            raise ValueError(f"unknown DeepMind Control task {env_id!r}, nearest: {nearest}")
+        env_id = full
+    domain = env_id.removeprefix(PREFIX).partition("-")[0]
+    height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
+    render_kwargs: dict[str, Any] = {"height": height, "width": width}
+    render_kwargs["camera_id"] = CAMERAS.get(domain, 0) if camera_id is None else camera_id
+    if fast_rendering:
+        render_kwargs["render_flag_overrides"] = {"shadow": False, "reflection": False}
+    env = gym.make(
+        env_id,
+        render_mode="rgb_array",
+        render_kwargs=render_kwargs,
+        # LQR draws its masses and springs when it is made: one task, not another one each time.
+        task_kwargs={"random": 0},
+        disable_env_checker=True,
+    )
+    env.unwrapped.np_random = np.random.RandomState(seed)  # type: ignore[assignment]
+    if fast_rendering:
+        env.unwrapped.physics.model.vis.quality.offsamples = 0  # type: ignore[attr-defined]
+    if domain == "lqr":
+        # Its actions have no bounds (1e10), which no policy with squashed actions can use.
+        env = TimeLimit(env, EPISODE_LENGTH)
+        assert isinstance(env.action_space, spaces.Box)
+        env = TransformAction(env, lambda action: action, spaces.Box(-1.0, 1.0, env.action_space.shape, np.float64))
+    env = wrap_env(env, pixels=pixels, action_repeat=action_repeat, frame_stack=frame_stack)
+    env.action_space.seed(seed)
+    return env
+
+
+def wrap_env(env: gym.Env, *, pixels: bool = False, action_repeat: int = 1, frame_stack: int = 1) -> gym.Env:
+    """
+    Action repeat, flat float32 vectors or images, and frame stack, in the order that ``WindowReplayBuffer`` needs.
+
+    :param env: Any Gymnasium environment; for ``pixels`` with ``render_mode="rgb_array"``
+    :param pixels: As in :func:`make_dmc_env`; images are of the size that the environment renders
+    :param action_repeat: As in :func:`make_dmc_env`
+    :param frame_stack: As in :func:`make_dmc_env`
+    """
+    for name, value in (("action_repeat", action_repeat), ("frame_stack", frame_stack)):
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, not {value}")
+    if action_repeat > 1:
+        env = RepeatAction(env, action_repeat)
+    if pixels:
+        # Outside the action repeat: one picture for each agent step.
+        env = AddRenderObservation(env, render_only=True)
+        height, width, channels = env.observation_space.shape  # type: ignore[misc]
+        channel_first = spaces.Box(0, 255, (channels, height, width), np.uint8)
+        env = TransformObservation(env, lambda image: np.ascontiguousarray(image.transpose(2, 0, 1)), channel_first)
+    else:
+        env = FlattenObservation(env)
+        assert isinstance(env.observation_space, spaces.Box)
+        low, high = (bound.astype(np.float32) for bound in (env.observation_space.low, env.observation_space.high))
+        env = TransformObservation(env, lambda vector: vector.astype(np.float32), spaces.Box(low, high, dtype=np.float32))
+    if frame_stack > 1:
+        assert env.observation_space.shape is not None
+        first, *rest = env.observation_space.shape
+        env = ReshapeObservation(FrameStackObservation(env, frame_stack), (frame_stack * first, *rest))
+    return env
