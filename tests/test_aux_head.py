@@ -1,0 +1,183 @@
+"""AuxHead against an oracle that walks over the tokens one by one."""
+
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from sb3_aarl import AuxLoss
+from sb3_aarl.aux_head import AuxHead
+from sb3_aarl.aux_loss import OPERATORS
+from sb3_aarl.buffers import WindowSamples
+
+LATENT, ACTION, OBSERVATION = 3, 2, 4
+Observations = th.Tensor | dict[str, th.Tensor]
+
+
+class Encoder(nn.Module):
+    """Any encoder: a linear map of all that is observed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(OBSERVATION, LATENT)
+        self.calls: list[bool] = []
+
+    def forward(self, observations: Observations) -> th.Tensor:
+        self.calls.append(th.is_grad_enabled())
+        if isinstance(observations, dict):
+            observations = th.cat([observations[key].flatten(start_dim=1) for key in ("image", "vector")], dim=1)
+        return self.linear(observations.flatten(start_dim=1)).tanh()
+
+
+def whole_windows(horizon: int, batch: int, kind: str) -> WindowSamples:
+    """Windows with every observation; no two numbers in them are equal."""
+
+    def observations(*shape: int) -> th.Tensor:
+        return th.randn(batch, horizon + 1, *shape)
+
+    if kind == "dict":
+        seen: Observations = {"image": observations(1, 1, 3), "vector": observations(1)}
+    else:
+        seen = observations(1, 2, 2) if kind == "image" else observations(OBSERVATION)
+    return WindowSamples(seen, th.randn(batch, horizon, ACTION), th.randn(batch, horizon, 1))
+
+
+def gathered(windows: WindowSamples, offsets: list[int]) -> WindowSamples:
+    """What the buffer gives when it is asked for these observations alone."""
+    seen = windows.observations
+    if isinstance(seen, dict):
+        return windows._replace(observations={key: value[:, offsets] for key, value in seen.items()})
+    return windows._replace(observations=seen[:, offsets])
+
+
+def embed(windows: WindowSamples, mask: tuple[bool, ...], encoder: Encoder) -> th.Tensor:
+    """Row by row and token by token; states first, then actions, then rewards."""
+    rows = []
+    for b in range(len(windows.actions)):
+        parts = []
+        for kind in range(3):
+            for offset in range(len(windows.actions[b]) + 1):
+                index = 3 * offset + kind
+                if index >= len(mask) or not mask[index]:
+                    continue
+                if kind == 0:
+                    seen = windows.observations
+                    one = (
+                        {key: value[b, offset][None] for key, value in seen.items()}
+                        if isinstance(seen, dict)
+                        else seen[b, offset][None]
+                    )
+                    parts.append(encoder(one)[0])
+                else:
+                    parts.append((windows.actions, windows.rewards)[kind - 1][b, offset])
+        rows.append(th.cat(parts))
+    return th.stack(rows)
+
+
+def oracle(head: AuxHead, windows: WindowSamples, encoder: Encoder, target_encoder: Encoder) -> th.Tensor:
+    source = embed(windows, head.loss.source, encoder)
+    target = embed(windows, head.loss.target, target_encoder).detach()
+    first, *_, last = head.predictor
+    hidden = source @ first.weight.T + first.bias
+    if len(head.predictor) == 4:
+        norm = head.predictor[1]
+        hidden = (hidden - hidden.mean(dim=0)) / (hidden.var(dim=0, unbiased=False) + norm.eps).sqrt()
+        hidden = hidden * norm.weight + norm.bias
+    return head.operator(hidden.clamp(min=0) @ last.weight.T + last.bias, target)
+
+
+@st.composite
+def losses(draw: st.DrawFn) -> AuxLoss:
+    horizon = draw(st.integers(1, 4))
+    bits = st.lists(st.booleans(), min_size=3 * horizon + 1, max_size=3 * horizon + 1)
+    source = draw(bits.filter(lambda mask: any(mask[::3])))
+    return AuxLoss(
+        horizon, tuple(source), tuple(draw(bits.filter(any))), draw(st.sampled_from(OPERATORS)), draw(st.booleans())
+    )
+
+
+@settings(deadline=None, max_examples=60)
+@given(losses(), st.sampled_from(["vector", "image", "dict"]), st.booleans(), st.sampled_from([5, None]), st.integers(0, 99))
+def test_value_and_gradients_against_the_oracle(
+    loss: AuxLoss, kind: str, batch_norm: bool, width: int | None, seed: int
+) -> None:
+    th.manual_seed(seed)
+    head = AuxHead(loss, LATENT, ACTION, width, batch_norm).double()
+    encoder, target_encoder = Encoder().double(), Encoder().double()
+    windows = whole_windows(loss.horizon, 4, kind)
+    windows = WindowSamples(
+        {key: value.double() for key, value in windows.observations.items()}
+        if isinstance(windows.observations, dict)
+        else windows.observations.double(),
+        windows.actions.double(),
+        windows.rewards.double(),
+    )
+    named = [i for i in range(loss.horizon + 1) if loss.source[3 * i] or loss.target[3 * i]]
+    assert head.offsets == named
+
+    trained = [*encoder.parameters(), *head.parameters()]
+    value = head(gathered(windows, named), encoder, target_encoder)
+    assert value.shape == ()
+    # One pass of each encoder over all its states, and none of the target's with gradients.
+    assert encoder.calls == [True]
+    assert target_encoder.calls == ([False] if any(loss.target[::3]) else [])
+    gradients = th.autograd.grad(value, trained, retain_graph=True)
+    value.backward()
+    assert all(parameter.grad is None for parameter in target_encoder.parameters())
+
+    expected = oracle(head, windows, encoder, target_encoder)
+    th.testing.assert_close(value, expected)
+    for one, other in zip(gradients, th.autograd.grad(expected, trained), strict=True):
+        th.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("negatives", [False, True])
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_gradients_reach_encoder_and_predictor(operator: str, negatives: bool) -> None:
+    th.manual_seed(0)
+    head = AuxHead(AuxLoss.parse("{s_t, a_t, r_t+1} -> {s_t+2, r_t}", operator, negatives), LATENT, ACTION)
+    encoder, target_encoder = Encoder(), Encoder()
+    head(gathered(whole_windows(2, 16, "vector"), head.offsets), encoder, target_encoder).backward()
+    trained = [*encoder.parameters(), *head.predictor.parameters()]
+    if (operator, negatives) == ("mse", True):
+        # |y^ - y+|^2 - |y^ - y-|^2 is linear in y^ and its slopes 2 (y- - y+) add up to nothing over the batch.
+        assert trained.pop().grad.abs().max() < 1e-6
+    assert all(parameter.grad.abs().max() > 1e-6 for parameter in trained)
+    # W of the bilinear operator is trained too.
+    assert [name for name, _ in head.operator.named_parameters()] == (["weight"] if operator == "bilinear" else [])
+    assert all(parameter.grad.abs().max() > 1e-6 for parameter in head.operator.parameters())
+    assert all(parameter.grad is None for parameter in target_encoder.parameters())
+
+
+def test_encoder_and_target_encoder_that_are_one() -> None:
+    """Even then the target carries no gradient: predicting s_t perfectly from s_t leaves the encoder alone."""
+    th.manual_seed(0)
+    head = AuxHead(AuxLoss.parse("{s_t} -> {s_t}"), LATENT, ACTION)
+    head.predictor = nn.Identity()  # type: ignore[assignment]
+    encoder = Encoder()
+    value = head(gathered(whole_windows(1, 5, "vector"), head.offsets), encoder, encoder)
+    assert value.item() == 0 and encoder.calls == [True, False]
+
+
+@pytest.mark.parametrize(
+    "text, source_dim, target_dim",
+    [
+        ("{s_t} -> {s_t}", 50, 50),
+        ("{s_t, a_t} -> {r_t}", 56, 1),
+        ("{s_t, s_t+2, a_t+1, r_t, r_t+1} -> {s_t+1, a_t, a_t+1, r_t+1}", 108, 63),
+    ],
+)
+def test_widths_of_the_predictor(text: str, source_dim: int, target_dim: int) -> None:
+    loss = AuxLoss.parse(text, "bilinear")
+
+    def widths(head: AuxHead) -> list[tuple[int, int]]:
+        return [(layer.in_features, layer.out_features) for layer in head.predictor if isinstance(layer, nn.Linear)]
+
+    paper = AuxHead(loss, latent_dim=50, action_dim=6)
+    assert widths(paper) == [(source_dim, 256), (256, target_dim)]
+    assert [type(layer) for layer in paper.predictor] == [nn.Linear, nn.ReLU, nn.Linear]
+    public_code = AuxHead(loss, 50, 6, predictor_width=None, predictor_batch_norm=True)
+    assert widths(public_code) == [(source_dim, 2 * source_dim), (2 * source_dim, target_dim)]
+    assert [type(layer) for layer in public_code.predictor] == [nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Linear]
+    assert paper.operator.weight.shape == (target_dim, target_dim)

@@ -1,0 +1,224 @@
+"""Encoders against naive forward passes, and their initialisation."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from scipy.signal import correlate
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from torch import nn
+
+from sb3_aarl.encoders import ENCODERS, MLP, DenseMLP, MultiInputEncoder, PixelEncoder, encoder_class
+
+
+def images(channels: int, height: int, width: int) -> spaces.Box:
+    return spaces.Box(0, 255, (channels, height, width), np.uint8)
+
+
+def vectors(*shape: int) -> spaces.Box:
+    return spaces.Box(-1, 1, shape, np.float32)
+
+
+def randomize(module: nn.Module, seed: int = 0) -> None:
+    """Parameters that hide nothing: biases are not zero, kernels not a delta."""
+    generator = th.Generator().manual_seed(seed)
+    for parameter in module.parameters():
+        parameter.data = th.randn(parameter.shape, generator=generator) * 0.5
+
+
+def arrays(module: nn.Module) -> list[np.ndarray]:
+    return [parameter.detach().double().numpy() for parameter in module.parameters()]
+
+
+def naive_projection(x: np.ndarray, parameters: list[np.ndarray], tanh: bool = False) -> np.ndarray:
+    weight, bias, scale, shift = parameters
+    x = x @ weight.T + bias
+    centred = x - x.mean(axis=1, keepdims=True)
+    x = centred / np.sqrt((centred**2).mean(axis=1, keepdims=True) + 1e-5) * scale + shift
+    return np.tanh(x) if tanh else x
+
+
+@pytest.mark.parametrize("size", [(84, 84), (100, 100), (15, 15), (16, 15), (64, 48), (21, 90)])
+@pytest.mark.parametrize("channels", [1, 3, 9])
+def test_pixel_encoder_takes_any_size(size: tuple[int, int], channels: int) -> None:
+    space = images(channels, *size)
+    encoder = PixelEncoder(space, features_dim=6)
+    observations = preprocess_obs(th.as_tensor(np.stack([space.sample() for _ in range(3)])), space)
+    latents = encoder(observations)
+    assert latents.shape == (3, 6) == (3, encoder.features_dim)
+    trunk = encoder.trunk(observations)
+    assert trunk.shape == (3, encoder.trunk_dim)
+    # The first layer halves the picture and drops its rim, each of the other three takes a pixel on every side.
+    height, width = (int((length - 1) / 2) - 6 for length in size)
+    assert encoder.trunk_dim == 32 * height * width
+
+
+def test_pixel_encoder_at_the_papers_size() -> None:
+    encoder = PixelEncoder(images(9, 84, 84))
+    assert encoder.trunk_dim == 32 * 35 * 35 and encoder.features_dim == 50
+    convolutions = [layer for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)]
+    assert [(layer.in_channels, layer.out_channels, layer.kernel_size, layer.stride) for layer in convolutions] == [
+        (9, 32, (3, 3), (2, 2)),
+        *[(32, 32, (3, 3), (1, 1))] * 3,
+    ]
+
+
+@pytest.mark.parametrize("tanh", [False, True])
+@pytest.mark.parametrize("n_layers, n_filters, size", [(4, 3, (16, 19)), (1, 4, (5, 6)), (2, 2, (9, 8))])
+def test_pixel_encoder_against_naive_convolutions(n_layers: int, n_filters: int, size: tuple[int, int], tanh: bool) -> None:
+    space = images(2, *size)
+    encoder = PixelEncoder(space, 5, n_layers, n_filters, tanh)
+    randomize(encoder)
+    observations = preprocess_obs(th.as_tensor(np.stack([space.sample() for _ in range(2)])), space)
+    x = observations.double().numpy()
+    parameters = arrays(encoder.convolutions)
+    for layer, (weight, bias) in enumerate(zip(parameters[::2], parameters[1::2], strict=True)):
+        step = 2 if layer == 0 else 1
+        x = np.stack([[correlate(image, kernel, "valid")[0, ::step, ::step] for kernel in weight] for image in x])
+        x = np.maximum(x + bias[None, :, None, None], 0)
+    flat = x.reshape(len(x), -1)
+    np.testing.assert_allclose(encoder.trunk(observations).detach(), flat, rtol=1e-4, atol=1e-5)
+    expected = naive_projection(flat, arrays(encoder.projection), tanh)
+    np.testing.assert_allclose(encoder(observations).detach(), expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("size, n_layers", [((14, 84), 4), ((84, 14), 4), ((12, 12), 4), ((2, 9), 1)])
+def test_images_that_are_too_small(size: tuple[int, int], n_layers: int) -> None:
+    with pytest.raises(ValueError, match=rf"\(3, {size[0]}, {size[1]}\) are too small for {n_layers} convolutions"):
+        PixelEncoder(images(3, *size), n_layers=n_layers)
+
+
+def assert_orthogonal(matrix: np.ndarray, gain: float = 1.0) -> None:
+    """Rows or columns, whichever are fewer, are orthogonal to each other and of one length."""
+    rows, columns = matrix.shape
+    gram = matrix @ matrix.T if rows <= columns else matrix.T @ matrix
+    np.testing.assert_allclose(gram, gain**2 * np.eye(len(gram)), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "encoder",
+    [
+        PixelEncoder(images(3, 15, 17), 7, n_filters=5),
+        PixelEncoder(images(9, 15, 15), 50, n_filters=4),
+        DenseMLP(vectors(6), 9, n_layers=3, width=5),
+        MLP(vectors(6), 9, n_layers=3, width=5),
+        MultiInputEncoder(spaces.Dict(a=images(3, 15, 15), b=vectors(4)), 6, 5),
+    ],
+    ids=lambda encoder: type(encoder).__name__,
+)
+def test_initialisation(encoder: nn.Module) -> None:
+    seen = set()
+    for layer in encoder.modules():
+        if isinstance(layer, nn.Conv2d):
+            weight = layer.weight.detach().numpy()
+            # Delta-orthogonal: with the gain of ReLU in the middle, nothing around it.
+            assert_orthogonal(weight[:, :, 1, 1], np.sqrt(2))
+            weight = weight.copy()
+            weight[:, :, 1, 1] = 0
+            assert not weight.any()
+        elif isinstance(layer, nn.Linear):
+            assert_orthogonal(layer.weight.detach().numpy())
+        else:
+            continue
+        assert not layer.bias.any()
+        seen.add(type(layer))
+    assert nn.Linear in seen
+
+
+def test_a_fresh_convolution_keeps_lengths() -> None:
+    """What delta-orthogonal is for: each pixel's channels are rotated, so inner lengths grow by the gain alone."""
+    layer = PixelEncoder(images(3, 16, 16), n_filters=8).convolutions[0]
+    x = th.randn(2, 3, 16, 16)
+    middle = x[:, :, 1:-1:2, 1:-1:2]
+    np.testing.assert_allclose(layer(x).detach().norm(dim=1), np.sqrt(2) * middle.norm(dim=1), rtol=1e-4)
+
+
+@pytest.mark.parametrize("cls", [DenseMLP, MLP])
+@pytest.mark.parametrize("shape, n_layers, width", [((5,), 1, 4), ((3,), 4, 3), ((2, 3), 2, 5)])
+def test_mlps_against_a_naive_forward_pass(cls: type[DenseMLP], shape: tuple[int, ...], n_layers: int, width: int) -> None:
+    encoder = cls(vectors(*shape), 6, n_layers, width)
+    randomize(encoder)
+    observations = th.randn(7, *shape)
+    x = observations.double().numpy().reshape(7, -1)
+    parameters = arrays(encoder.layers)
+    assert len(parameters) == 2 * n_layers
+    for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
+        added = np.maximum(x @ weight.T + bias, 0)
+        x = np.concatenate([x, added], axis=1) if cls is DenseMLP else added
+    assert encoder.trunk_dim == x.shape[1]
+    np.testing.assert_allclose(encoder.trunk(observations).detach(), x, rtol=1e-4, atol=1e-5)
+    expected = naive_projection(x, arrays(encoder.projection))
+    np.testing.assert_allclose(encoder(observations).detach(), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_dense_mlp_has_the_papers_widths() -> None:
+    encoder = DenseMLP(vectors(17))
+    assert [tuple(layer.weight.shape) for layer in encoder.layers] == [(40, 17)]
+    assert (encoder.trunk_dim, encoder.features_dim) == (57, 40)
+    assert DenseMLP(vectors(17), n_layers=4).trunk_dim == 17 + 4 * 40
+
+
+def test_a_new_projection_is_like_the_own_but_shares_nothing() -> None:
+    encoder = DenseMLP(vectors(3), 4, width=2)
+    other = encoder.make_projection()
+    assert [p.shape for p in other.parameters()] == [p.shape for p in encoder.projection.parameters()]
+    assert not set(map(id, other.parameters())) & set(map(id, encoder.parameters()))
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [["camera", "wrist", "speed", "mode", "joints"], ["camera"], ["speed", "joints"]],
+    ids=["both", "images only", "vectors only"],
+)
+def test_multi_input_encoder_is_its_parts_side_by_side(keys: list[str]) -> None:
+    everything = {
+        "speed": vectors(3),
+        "camera": images(3, 15, 16),
+        "mode": spaces.Discrete(4),
+        "wrist": images(1, 17, 15),
+        "joints": vectors(2, 2),
+    }
+    space = spaces.Dict({key: everything[key] for key in keys})
+    encoder = MultiInputEncoder(space, cnn_output_dim=5, mlp_output_dim=4)
+    randomize(encoder)
+    batch = {key: th.as_tensor(np.stack([part.sample() for _ in range(3)])) for key, part in space.spaces.items()}
+    observations = preprocess_obs(batch, space)
+    assert isinstance(observations, dict)
+
+    # Each image on its own, all that is no image as one flat vector, in the space's order.
+    inputs = [observations[key] for key in space.spaces if key in ("camera", "wrist")]
+    flat = [observations[key].reshape(3, -1) for key in space.spaces if key not in ("camera", "wrist")]
+    inputs += [th.cat(flat, dim=1)] if flat else []
+    kinds = [PixelEncoder if x.ndim == 4 else DenseMLP for x in inputs]
+    assert [type(part) for part in encoder.encoders] == kinds
+    expected = [part(x) for part, x in zip(encoder.encoders, inputs, strict=True)]
+    assert [latent.shape[1] for latent in expected] == [5 if kind is PixelEncoder else 4 for kind in kinds]
+
+    latents = encoder(observations)
+    assert th.equal(latents, th.cat(expected, dim=1)) and latents.shape == (3, encoder.features_dim)
+    trunk = encoder.trunk(observations)
+    assert th.equal(trunk, th.cat([part.trunk(x) for part, x in zip(encoder.encoders, inputs, strict=True)], dim=1))
+    assert trunk.shape == (3, encoder.trunk_dim)
+    assert encoder.make_projection()(trunk).shape == latents.shape
+
+
+def test_names() -> None:
+    expected = {
+        "pixel": PixelEncoder,
+        "dense_mlp": DenseMLP,
+        "mlp": MLP,
+        "multi_input": MultiInputEncoder,
+        "identity": FlattenExtractor,
+    }
+    assert dict(ENCODERS) == expected
+    assert {name: encoder_class(name) for name in expected} == expected
+
+    class Own(BaseFeaturesExtractor):
+        pass
+
+    assert encoder_class(Own) is Own
+    with pytest.raises(
+        ValueError, match="unknown encoder 'cnn', expected one of pixel, dense_mlp, mlp, multi_input, identity"
+    ):
+        encoder_class("cnn")
