@@ -139,16 +139,16 @@ class Critic(_CropsImages, ContinuousCritic):
         """
         return self.extract_features(obs, self.features_extractor)
 
-    def q_values(self, latent: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def q_values(self, latent: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
         Q-values of all critics.
 
         :param latent: Latent states (batch, features_dim)
         :param actions: (batch, action_dim), scaled to [-1, 1]
-        :return: (batch, n_critics)
+        :return: One (batch, 1) for each critic
         """
         inputs = th.cat([latent, actions], dim=1)
-        return th.cat([q_network(inputs) for q_network in self.q_networks], dim=1)
+        return tuple(q_network(inputs) for q_network in self.q_networks)
 
 
 class SACAuxPolicy(SACPolicy):
@@ -200,8 +200,16 @@ class SACAuxPolicy(SACPolicy):
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
         encoder = encoder_class(features_extractor_class or self.default_encoder)
-        if issubclass(encoder, MultiInputEncoder) and not kwargs.get("normalize_images", True):
+        normalize_images = kwargs.get("normalize_images", True)
+        if issubclass(encoder, MultiInputEncoder) and not normalize_images:
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
+        # As SB3's NatureCNN: floats that nobody scales are mostly a mistake.
+        assert not issubclass(encoder, PixelEncoder) or is_image_space(
+            observation_space, normalized_image=not normalize_images
+        ), (
+            f"{encoder.__name__} is for images, not for {observation_space}. Images that are floats already, such as "
+            "VecNormalize's, have to be channel first and need policy_kwargs=dict(normalize_images=False)"
+        )
         super().__init__(
             observation_space,
             action_space,

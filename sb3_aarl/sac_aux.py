@@ -198,9 +198,11 @@ class SACAux(SAC):
 
     def _setup_model(self) -> None:
         # What each argument is called, in case that one of them does not fit.
-        for name in ("policy_delay", "target_update_interval", "crop_size"):
-            if getattr(self, name) < 1:
+        for name in ("policy_delay", "target_update_interval", "crop_size", "aux_batch_size", "predictor_width"):
+            if getattr(self, name) is not None and not getattr(self, name) >= 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.aux_coef < float("inf"):
+            raise ValueError(f"aux_coef must be a finite number of at least 0, not {self.aux_coef}")
         for name in ("tau", "encoder_tau"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
@@ -336,12 +338,12 @@ class SACAux(SAC):
             with th.no_grad():
                 next_actions, next_log_prob = self.actor.action_log_prob(next_obs)
                 next_latent = self.critic_target.encode(next_obs)
-                next_q, _ = self.critic_target.q_values(next_latent, next_actions).min(dim=1, keepdim=True)
+                next_q, _ = th.cat(self.critic_target.q_values(next_latent, next_actions), dim=1).min(dim=1, keepdim=True)
                 next_q = next_q - ent_coef * next_log_prob.reshape(-1, 1)
                 target_q = batch.rewards + (1 - batch.dones) * discounts * next_q
             latent = self.critic.encode(obs)
             q_values = self.critic.q_values(latent, batch.actions)
-            critic_loss = 0.5 * sum(F.mse_loss(q, target_q) for q in q_values.split(1, dim=1))
+            critic_loss = 0.5 * sum(F.mse_loss(q, target_q) for q in q_values)
             assert isinstance(critic_loss, th.Tensor)
             log("critic_loss", critic_loss)
             self.critic.optimizer.zero_grad()
@@ -361,7 +363,7 @@ class SACAux(SAC):
             if update_actor:
                 with th.no_grad():
                     latent = self.critic.encode(obs)
-                min_q, _ = self.critic.q_values(latent, actions_pi).min(dim=1, keepdim=True)
+                min_q, _ = th.cat(self.critic.q_values(latent, actions_pi), dim=1).min(dim=1, keepdim=True)
                 actor_loss = (ent_coef * log_prob - min_q).mean()
                 log("actor_loss", actor_loss)
                 self.actor.optimizer.zero_grad()
@@ -506,7 +508,8 @@ class SACAux(SAC):
         :param include: Attributes that are put in although they are usually left out
         :raises NonFiniteError: when a parameter is NaN or infinite; what is at ``path`` stays as it is
         """
-        for name, parameters in self.get_parameters().items():
+        variables = {name: getattr(self, name) for name in self._get_torch_save_params()[1]}
+        for name, parameters in {**self.get_parameters(), "model": variables}.items():
             for key, value in parameters.items():
                 if isinstance(value, th.Tensor) and not th.isfinite(value).all():
                     raise NonFiniteError(f"{name}.{key} is not finite: the model is not saved to {path}")
