@@ -7,7 +7,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.preprocessing import get_obs_shape
+from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
@@ -28,6 +28,12 @@ class WindowSamples(NamedTuple):
 
 class NoWindowError(ValueError):
     """No episode in the buffer is long enough for the horizon yet."""
+
+
+def _equal(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two arrays are the same; NaN is NaN, so that one in an observation does not look like a new episode."""
+    # The plain comparison is much faster, and mostly enough.
+    return bool((one == other).all()) or np.array_equal(one, other, equal_nan=True)
 
 
 class FrameStore:
@@ -114,6 +120,8 @@ class _Observations:
 
     def __getitem__(self, index: Any) -> np.ndarray:
         index = index if isinstance(index, tuple) else (index,)
+        if any(part is Ellipsis or part is None for part in index):
+            return self[:][index]
         where = np.ogrid[: self.shape[0], : self.shape[1]]
         positions, envs = (part[index[:2]] for part in np.broadcast_arrays(*where))
         observations = self.buffer.gather(self.key, positions, envs, self.following)
@@ -139,7 +147,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
     :param n_envs: Number of parallel environments
     :param optimize_memory_usage: Accepted for SB3; frames are stored once anyway
     :param handle_timeout_termination: Whether to bootstrap where an episode was truncated
-    :param n_steps: Number of steps of n-step returns in ``sample``
+    :param n_steps: Number of steps of n-step returns in ``sample``; only 1 for Dict observations, as in SB3
     :param gamma: Discount of n-step returns
     :param frame_stack: How many frames the environment stacks along the first axis of an observation, oldest first
         (channels of images, which SB3 puts first); one number, or one for each key of a Dict. At an episode's begin
@@ -159,6 +167,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         gamma: float = 0.99,
         frame_stack: int | Mapping[str, int] = 1,
     ):
+        if n_steps > 1 and isinstance(observation_space, spaces.Dict):
+            raise ValueError(f"n_steps={n_steps}: SB3 has no n-step returns for Dict observations")
         # SB3's ReplayBuffer would allocate its two arrays of observations.
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs)
         self.buffer_size = max(buffer_size // n_envs, 1)
@@ -168,6 +178,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self.gamma = gamma
 
         parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+        if isinstance(frame_stack, Mapping) and not set(frame_stack) <= set(parts):
+            raise ValueError(f"frame_stack={dict(frame_stack)} names keys that observations do not have: {sorted(parts)}")
         self.stores: dict[str, FrameStore] = {}
         for key, space in parts.items():
             stack = frame_stack.get(key, 1) if isinstance(frame_stack, Mapping) else frame_stack
@@ -186,7 +198,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         size = (self.buffer_size, self.n_envs)
         self.n_added = 0  # transitions per env ever added; number n lies at position n % buffer_size
         self._age = np.zeros(size, np.int32)  # steps since the episode began
-        self._zero_padded = np.zeros(size, bool)
+        self._zero_padded = {key: np.zeros(size, bool) for key in self.stores}
         self._final_slot = np.full(size, -1, np.int64)  # where the last frame of an episode lies aside
         self._free_slots: list[int] = []
         self._n_slots = 0
@@ -229,7 +241,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
             numbers + following,
             envs,
             self._age[positions, envs] + following,
-            self._zero_padded[positions, envs],
+            self._zero_padded[key][positions, envs],
             np.where(following, self._final_slot[positions, envs], -1),
         )
 
@@ -254,10 +266,12 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :raises ValueError: when a stack is not made of the frames before it; nothing is added then
         """
         current, following = self._by_key(obs), self._by_key(next_obs)
+        action = np.asarray(action).reshape(self.n_envs, self.action_dim)
+        reward = np.asarray(reward).reshape(self.n_envs)
         done = np.asarray(done, bool).reshape(self.n_envs)
         starts = self._episode_over.copy()
         for key, last in self._last_next_obs.items():
-            starts |= (current[key] != last).reshape(self.n_envs, -1).any(axis=1)
+            starts |= [not _equal(*pair) for pair in zip(current[key], last, strict=True)]
         zero_padded = self._check_stacks(current, following, starts, done)
 
         pos, row = self.pos, self.n_added
@@ -275,12 +289,14 @@ class WindowReplayBuffer(NStepReplayBuffer):
         for key, store in self.stores.items():
             store.frames[row % len(store.frames)] = store.split(current[key])[:, -1]
             store.frames[(row + 1) % len(store.frames)] = store.split(following[key])[:, -1]
+            padded = self._zero_padded[key]
+            padded[pos] = np.where(starts, zero_padded[key], padded[previous])
         self._age[pos] = np.where(starts, 0, self._age[previous] + 1)
-        self._zero_padded[pos] = np.where(starts, zero_padded, self._zero_padded[previous])
-        self.actions[pos] = np.asarray(action).reshape(self.n_envs, self.action_dim)
+        self.actions[pos] = action
         self.rewards[pos] = reward
         self.dones[pos] = done
-        self.timeouts[pos] = [self.handle_timeout_termination and info.get("TimeLimit.truncated", False) for info in infos]
+        timeouts = [self.handle_timeout_termination and info.get("TimeLimit.truncated", False) for info in infos]
+        self.timeouts[pos] = np.array(timeouts).reshape(self.n_envs)  # extend() may be given rows of another buffer's
         for env in np.flatnonzero(done):
             self._lay_aside(pos, env, {key: store.split(following[key])[env, -1] for key, store in self.stores.items()})
         self._episode_over = done
@@ -307,21 +323,21 @@ class WindowReplayBuffer(NStepReplayBuffer):
 
     def _check_stacks(
         self, current: dict[str, np.ndarray], following: dict[str, np.ndarray], starts: np.ndarray, done: np.ndarray
-    ) -> np.ndarray:
-        """Which envs fill a stack up with zeros (where ``starts``); refuses stacks that frames do not make."""
-        zero_padded = np.zeros(self.n_envs, bool)
+    ) -> dict[str, np.ndarray]:
+        """Which envs fill a stack up with zeros (where ``starts``), by key; refuses stacks that frames do not make."""
+        zero_padded = {key: np.zeros(self.n_envs, bool) for key in self.stores}
         for key, store in self.stores.items():
             if store.stack == 1:
                 continue
             old, new = store.split(current[key]), store.split(following[key])
             for env in range(self.n_envs):
-                if starts[env] and not (old[env, :-1] == old[env, -1]).all():
+                if starts[env] and not _equal(old[env, :-1], np.broadcast_to(old[env, -1], old[env, :-1].shape)):
                     if old[env, :-1].any():
                         raise self._stack_error(key, env, "an episode begins neither with one frame repeated nor with zeros")
-                    zero_padded[env] = True
-                # VecNormalize gives an episode's last observation back with rounding errors.
-                rounded = done[env] and np.issubdtype(new.dtype, np.floating)
-                if not rounded and not (new[env, :-1] == old[env, 1:]).all():
+                    zero_padded[key][env] = True
+                # VecNormalize, whose spaces are always float, gives an episode's last observation back with rounding errors.
+                rounded = done[env] and np.issubdtype(store.frames.dtype, np.floating)
+                if not rounded and not _equal(new[env, :-1], old[env, 1:]):
                     raise self._stack_error(key, env, "the next observation is not the last one plus one new frame")
         return zero_padded
 
@@ -344,41 +360,20 @@ class WindowReplayBuffer(NStepReplayBuffer):
             return super()._get_samples(batch_inds, env)
         return ReplayBuffer._get_samples(self, batch_inds, env)
 
-    def _whole(self, starts: np.ndarray, envs: np.ndarray, horizon: int) -> np.ndarray:
-        """Which windows, given by the age of their first transition in the buffer (0: the oldest), are inside one episode."""
-        inside = starts + horizon <= self.size()
-        steps = self._position(starts[:, None] + np.arange(horizon - 1))
-        over = (self.dones[steps, envs[:, None]] != 0) | (self.timeouts[steps, envs[:, None]] != 0)
-        return inside & ~over.any(axis=1)
-
-    def _position(self, order: np.ndarray) -> np.ndarray:
-        """From the order of transitions (0: the oldest) to positions."""
-        return (order + (self.pos if self.full else 0)) % self.buffer_size
-
     def _draw_windows(self, batch_size: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        """Starts (in order, 0: the oldest) and envs of windows, uniform over all whole ones."""
+        """Positions of the last steps, and envs, of windows, uniform over all whole ones."""
         if horizon < 1:
             raise ValueError(f"a horizon is at least 1, not {horizon}")
-        size = self.size()
-        drawn: list[tuple[np.ndarray, np.ndarray]] = []
-        missing = batch_size
-        # Mostly all but a few windows are whole: drawing again what is not keeps the rest uniform, and costs nothing.
-        for _ in range(8 if size >= horizon else 0):
-            starts, envs = np.random.randint(size, size=missing), np.random.randint(self.n_envs, size=missing)
-            whole = self._whole(starts, envs, horizon)
-            drawn.append((starts[whole], envs[whole]))
-            missing -= int(whole.sum())
-            if not missing:
-                break
-        if missing:
-            every_start, every_env = (grid.ravel() for grid in np.mgrid[:size, : self.n_envs])
-            whole = np.flatnonzero(self._whole(every_start, every_env, horizon))
-            if not len(whole):
-                raise NoWindowError(f"no episode in the replay buffer spans {horizon} agent steps yet")
-            chosen = whole[np.random.randint(len(whole), size=missing)]
-            drawn.append((every_start[chosen], every_env[chosen]))
-        starts, envs = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-        return starts, envs
+        # A step that has horizon - 1 steps of its episode before it ends a whole window, if they are all still there.
+        whole = self._age[: self.size()] >= horizon - 1
+        if self.full:
+            oldest = np.arange(min(horizon - 1, self.buffer_size))
+            whole[(self.pos + oldest) % self.buffer_size] = False
+        ends = np.flatnonzero(whole)
+        if not len(ends):
+            raise NoWindowError(f"no episode in the replay buffer spans {horizon} agent steps yet")
+        positions, envs = np.divmod(ends[np.random.randint(len(ends), size=batch_size)], self.n_envs)
+        return positions, envs
 
     def sample_windows(
         self,
@@ -396,39 +391,49 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :param offsets: Gather only the observations at these offsets from the start (0 to k); None for all k + 1
         :raises NoWindowError: when no episode is long enough yet
         """
-        starts, envs = self._draw_windows(batch_size, horizon)
-        steps = self._position(starts[:, None] + np.arange(horizon))
         wanted = np.arange(horizon + 1) if offsets is None else np.asarray(offsets, np.int64)
+        if ((wanted < 0) | (wanted > horizon)).any():
+            raise ValueError(f"offsets {wanted.tolist()} of a window of horizon {horizon} are not all in 0 to {horizon}")
+        ends, envs = self._draw_windows(batch_size, horizon)
+        steps = (ends[:, None] + np.arange(1 - horizon, 1)) % self.buffer_size
         # The last observation is the next one of the last step: the episode may have ended there.
         following = wanted == horizon
-        at = self._position(starts[:, None] + wanted - following)
+        at = steps[:, wanted - following]
         observations = {key: self.gather(key, at, envs[:, None], following) for key in self.stores}
         is_dict = isinstance(self.observation_space, spaces.Dict)
         normalized = self._normalize_obs(observations if is_dict else observations[""], env)
         rewards = self._normalize_reward(self.rewards[steps, envs[:, None]][..., None], env)
+        # All arrays are new ones already.
         return WindowSamples(
-            {key: self.to_torch(value) for key, value in normalized.items()}
+            {key: self.to_torch(value, copy=False) for key, value in normalized.items()}
             if isinstance(normalized, dict)
-            else self.to_torch(normalized),
-            self.to_torch(self.actions[steps, envs[:, None]]),
-            self.to_torch(rewards),
+            else self.to_torch(normalized, copy=False),
+            self.to_torch(self.actions[steps, envs[:, None]], copy=False),
+            self.to_torch(rewards, copy=False),
         )
 
 
 def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
     """
-    How many frames an environment stacks, as its wrappers tell.
+    How many frames an environment stacks along the first axis of observations, as its wrappers tell.
 
-    :param env: Vectorized environment
-    :return: The size of SB3's VecFrameStack times that of Gymnasium's FrameStackObservation, 1 without them; for Dict
-        observations by key, 1 where the first axis is not a multiple of it
+    :param env: Vectorized environment, images transposed as SB3's algorithms do
+    :return: The size of SB3's VecFrameStack, else of Gymnasium's FrameStackObservation; for Dict observations by key.
+        1 without them, where the first axis is not a multiple of it, and where VecFrameStack took the last axis
     """
-    outer = unwrap_vec_wrapper(env, VecFrameStack)
-    stack = outer.stacked_obs.n_stack if isinstance(outer, VecFrameStack) else 1
-    if env.has_attr("stack_size"):
-        stack *= int(env.get_attr("stack_size")[0])
     space = env.observation_space
     parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    fits = {key: bool(part.shape) and part.shape[0] % stack == 0 for key, part in parts.items()}  # type: ignore[index]
-    stacks = {key: stack if fits[key] else 1 for key in parts}
+    outer = unwrap_vec_wrapper(env, VecFrameStack)
+    inner: dict[str, Any] = {}
+    if isinstance(outer, VecFrameStack):
+        # Whatever stacks inside of it only makes its frames.
+        stack = outer.stacked_obs.n_stack
+        inner = getattr(outer.stacked_obs, "sub_stacked_observations", {"": outer.stacked_obs})
+    else:
+        stack = int(env.get_attr("stack_size")[0]) if env.has_attr("stack_size") else 1
+    stacks: dict[str, int] = {}
+    for key, part in parts.items():
+        shape = part.shape or (1,)
+        first_axis = not inner or inner[key].channels_first or len(shape) == 1 or is_image_space(part)
+        stacks[key] = stack if first_axis and shape[0] % stack == 0 else 1
     return stacks if isinstance(space, spaces.Dict) else stacks[""]

@@ -1,0 +1,657 @@
+"""WindowReplayBuffer against whole trajectories kept in plain lists, and against SB3's own buffers."""
+
+import copy
+import io
+import pickle
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import FlattenObservation, FrameStackObservation, TransformObservation
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chisquare
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
+
+from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, detect_frame_stack
+
+Obs = np.ndarray | dict[str, np.ndarray]
+ACTIONS = spaces.Box(-1, 1, (2,))
+FRAME = (2, 1, 2)
+
+
+class Step:
+    """One transition of one env; its action and reward are found nowhere else in the trajectories."""
+
+    def __init__(self, env: int, number: int, episode: int, obs: Obs, next_obs: Obs, ends: str):
+        self.env, self.number, self.episode = env, number, episode
+        self.obs, self.next_obs = obs, next_obs
+        self.action = np.array([env, number], np.float32)
+        self.reward = np.float32(-number - env / 8)
+        self.done = ends in ("terminated", "truncated")
+        self.info = {"TimeLimit.truncated": ends == "truncated"}
+
+
+def numbered_frame(env: int, number: int, dtype: Any = np.uint8) -> np.ndarray:
+    """A frame that no other pair of numbers has, for 255 numbers, and that is nowhere zero."""
+    return np.array([number % 255 + 1, env + 1, number % 7 + 1, number // 255 + 1], dtype).reshape(FRAME)
+
+
+def stacked(frames: list[np.ndarray], t: int, stack: int, padding: str) -> np.ndarray:
+    first = frames[0] if padding == "repeat" else np.zeros_like(frames[0])
+    return np.concatenate([frames[i] if i >= 0 else first for i in range(t - stack + 1, t + 1)])
+
+
+def trajectory(
+    env: int, episodes: list[tuple[int, str]], stack: int, padding: str, as_dict: bool = False, dtype: Any = np.uint8
+) -> Iterator[Step]:
+    """The steps of one env, over and over through these episodes; "by hand" is a reset that nobody was told of."""
+    number, n_frames, episode = 0, 0, 0
+    while True:
+        length, how = episodes[episode % len(episodes)]
+        frames = [numbered_frame(env, n_frames + t, dtype) for t in range(length + 1)]
+        n_frames += length + 1
+        for t in range(length):
+            now, then = (
+                {"pixels": stacked(frames, i, stack, padding), "state": frames[i].ravel().astype(np.float32) / 2}
+                if as_dict
+                else stacked(frames, i, stack, padding)
+                for i in (t, t + 1)
+            )
+            yield Step(env, number, episode, now, then, how if t == length - 1 else "goes on")
+            number += 1
+        episode += 1
+
+
+def batched(observations: list[Any]) -> Any:
+    if isinstance(observations[0], dict):
+        return {key: np.stack([obs[key] for obs in observations]) for key in observations[0]}
+    return np.stack(observations)
+
+
+def transition(steps: list[Step]) -> tuple[Any, ...]:
+    """What SB3's algorithms give to ``add``."""
+    return (
+        batched([step.obs for step in steps]),
+        batched([step.next_obs for step in steps]),
+        np.stack([step.action for step in steps]),
+        np.array([step.reward for step in steps]),
+        np.array([step.done for step in steps]),
+        [step.info for step in steps],
+    )
+
+
+def observation_space(stack: int, as_dict: bool = False, dtype: Any = np.uint8) -> spaces.Space:
+    pixels = spaces.Box(0, 255, (FRAME[0] * stack, *FRAME[1:]), dtype)
+    return spaces.Dict({"pixels": pixels, "state": spaces.Box(0, 255, (4,), np.float32)}) if as_dict else pixels
+
+
+def make_buffer(
+    buffer_size: int, n_envs: int = 1, stack: int = 1, as_dict: bool = False, dtype: Any = np.uint8, **kwargs: Any
+) -> WindowReplayBuffer:
+    frame_stack = {"pixels": stack} if as_dict else stack
+    space = observation_space(stack, as_dict, dtype)
+    return WindowReplayBuffer(buffer_size, space, ACTIONS, "cpu", n_envs=n_envs, frame_stack=frame_stack, **kwargs)
+
+
+def whole_windows(histories: list[list[Step]], capacity: int, horizon: int) -> dict[tuple[int, int], list[Step]]:
+    """Every window inside one episode whose steps are among the last ``capacity`` of its env, by env and first number."""
+    windows = {}
+    for history in histories:
+        kept = history[-capacity:]
+        for i in range(len(kept) - horizon + 1):
+            window = kept[i : i + horizon]
+            if window[0].episode == window[-1].episode:
+                windows[(window[0].env, window[0].number)] = window
+    return windows
+
+
+def assert_same(actual: Any, expected: Any) -> None:
+    """Equality of tensors, arrays, or dicts of them, data types included."""
+    if isinstance(expected, dict):
+        assert actual.keys() == expected.keys()
+        for key in expected:
+            assert_same(actual[key], expected[key])
+    else:
+        actual, expected = np.asarray(actual), np.asarray(expected)
+        assert actual.dtype == expected.dtype
+        np.testing.assert_array_equal(actual, expected)
+
+
+def assert_same_samples(one: ReplayBuffer, other: ReplayBuffer, env: VecNormalize | None = None) -> None:
+    for seed in range(3):
+        drawn = []
+        for buffer in (one, other):
+            np.random.seed(seed)
+            drawn.append(buffer.sample(40, env=env)._asdict())
+        if drawn[0].get("discounts") is None:
+            drawn = [{key: value for key, value in sample.items() if key != "discounts"} for sample in drawn]
+        assert_same(*drawn)
+
+
+def assert_same_windows(one: WindowReplayBuffer, other: WindowReplayBuffer, horizon: int) -> None:
+    drawn = []
+    for buffer in (one, other):
+        np.random.seed(0)
+        drawn.append(buffer.sample_windows(40, horizon)._asdict())
+    assert_same(*drawn)
+
+
+def check_windows(buffer: WindowReplayBuffer, histories: list[list[Step]], horizon: int) -> None:
+    """All windows that are whole can be drawn, nothing else can, and each holds what happened."""
+    windows = whole_windows(histories, buffer.buffer_size, horizon)
+    if not windows:
+        with pytest.raises(NoWindowError, match=f"spans {horizon} agent steps"):
+            buffer.sample_windows(4, horizon)
+        return
+    # One that can be drawn stays out with a probability of exp(-30).
+    drawn = buffer.sample_windows(30 * len(windows), horizon)
+    keys = [(int(env), int(number)) for env, number in drawn.actions[:, 0]]
+    assert set(keys) == set(windows)
+    expected = [windows[key] for key in keys]
+    assert_same(drawn.actions, np.stack([[step.action for step in window] for window in expected]))
+    assert_same(drawn.rewards, np.stack([[[step.reward] for step in window] for window in expected]))
+    observations = [batched([*(step.obs for step in window), window[-1].next_obs]) for window in expected]
+    assert_same(drawn.observations, batched(observations))
+
+
+EPISODES = st.lists(
+    st.tuples(st.integers(1, 9), st.sampled_from(["terminated", "truncated", "by hand"])), min_size=1, max_size=5
+)
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    episodes=st.lists(EPISODES, min_size=1, max_size=4),
+    capacity=st.integers(1, 14),
+    n_added=st.integers(1, 60),
+    stack=st.integers(1, 4),
+    paddings=st.tuples(*[st.sampled_from(["repeat", "zeros"])] * 4),
+    as_dict=st.booleans(),
+    data=st.data(),
+)
+def test_windows_are_those_of_the_trajectories(episodes, capacity, n_added, stack, paddings, as_dict, data):
+    n_envs = len(episodes)
+    buffer = make_buffer(capacity * n_envs + data.draw(st.integers(0, n_envs - 1)), n_envs, stack, as_dict)
+    assert buffer.buffer_size == capacity
+    envs = [trajectory(env, plan, stack, paddings[env], as_dict) for env, plan in enumerate(episodes)]
+    histories: list[list[Step]] = [[] for _ in envs]
+    for _ in range(n_added):
+        steps = [next(env) for env in envs]
+        obs, next_obs, *rest = transition(steps)
+        buffer.add(obs, next_obs, *rest)
+        # An env may write its next observations over the last ones.
+        for part in (obs, next_obs):
+            for array in part.values() if as_dict else [part]:
+                array.fill(77)
+        for history, step in zip(histories, steps, strict=True):
+            history.append(step)
+    for horizon in (1, 2, data.draw(st.integers(3, 11))):
+        check_windows(buffer, histories, horizon)
+    # Single transitions too: SB3's arrays, as they would be.
+    for env, history in enumerate(histories):
+        for step in history[-capacity:]:
+            position = step.number % capacity
+            observations, following = buffer.observations, buffer.next_observations
+            if as_dict:
+                assert_same({key: value[position, env] for key, value in observations.items()}, step.obs)
+                assert_same({key: value[position, env] for key, value in following.items()}, step.next_obs)
+            else:
+                assert_same(observations[position, env], step.obs)
+                assert_same(following[position, env], step.next_obs)
+
+
+@settings(max_examples=25, deadline=None)
+@given(episodes=EPISODES, n_added=st.integers(6, 60), horizon=st.integers(1, 4), stack=st.integers(1, 3), data=st.data())
+def test_offsets_gather_just_those(episodes, n_added, horizon, stack, data):
+    buffer = make_buffer(20, 1, stack)
+    env = trajectory(0, [(6, "truncated"), *episodes], stack, "repeat")
+    for _ in range(n_added):
+        buffer.add(*transition([next(env)]))
+    offsets = data.draw(st.lists(st.integers(0, horizon), min_size=1, max_size=horizon + 1))
+    try:
+        np.random.seed(1)
+        everything = buffer.sample_windows(30, horizon)
+    except NoWindowError:
+        # The six steps that the ring began with were overwritten by shorter episodes.
+        assert max(length for length, _ in episodes) < 6
+        return
+    np.random.seed(1)
+    some = buffer.sample_windows(30, horizon, offsets=offsets)
+    assert_same(some.observations, everything.observations[:, offsets])
+    assert_same(some.actions, everything.actions)
+    assert_same(some.rewards, everything.rewards)
+
+
+def filled(buffer: ReplayBuffer, n_added: int, episodes: list[tuple[int, str]], **kwargs: Any) -> list[list[Step]]:
+    envs = [trajectory(env, episodes[env:] + episodes[:env], **kwargs) for env in range(buffer.n_envs)]
+    histories: list[list[Step]] = [[] for _ in envs]
+    for _ in range(n_added):
+        steps = [next(env) for env in envs]
+        buffer.add(*transition(steps))
+        for history, step in zip(histories, steps, strict=True):
+            history.append(step)
+    return histories
+
+
+LIFE = [(7, "truncated"), (1, "terminated"), (4, "terminated"), (12, "truncated"), (1, "truncated"), (3, "terminated")]
+
+
+@pytest.mark.parametrize("horizon", [1, 3, 7])
+def test_whole_windows_are_drawn_uniformly(horizon):
+    buffer = make_buffer(80, n_envs=2)
+    histories = filled(buffer, 101, LIFE, stack=1, padding="repeat")
+    windows = whole_windows(histories, buffer.buffer_size, horizon)
+    np.random.seed(0)
+    drawn = buffer.sample_windows(200 * len(windows), horizon)
+    counts = dict.fromkeys(windows, 0)
+    for env, number in drawn.actions[:, 0]:
+        counts[(int(env), int(number))] += 1
+    assert chisquare(list(counts.values())).pvalue > 0.01
+
+
+class Shown(gym.Env):
+    """Shows frames that count upwards; episodes of five steps."""
+
+    def __init__(self, space: spaces.Space):
+        self.observation_space = space
+        self.action_space = ACTIONS
+        self.counter = 0
+
+    def _observation(self) -> Obs:
+        self.counter += 1
+
+        def numbered(space: spaces.Space) -> np.ndarray:
+            return (np.arange(np.prod(space.shape)) % 7 + self.counter).reshape(space.shape).astype(space.dtype)
+
+        if isinstance(self.observation_space, spaces.Dict):
+            return {key: numbered(space) for key, space in self.observation_space.items()}
+        return numbered(self.observation_space)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        self.t = 0
+        return self._observation(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        self.t += 1
+        return self._observation(), float(self.t), self.counter % 2 == 0 and self.t >= 5, self.t >= 5, {}
+
+
+VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+IMAGE = spaces.Box(0, 255, (40, 48, 3), np.uint8)
+
+
+@pytest.mark.parametrize("handle_timeout_termination", [True, False])
+@pytest.mark.parametrize("kind, n_steps", [("image", 1), ("image", 3), ("vector", 1), ("vector", 3), ("dict", 1)])
+def test_samples_are_those_of_sb3(kind, n_steps, handle_timeout_termination):
+    as_dict, dtype = kind == "dict", np.float32 if kind == "vector" else np.uint8
+    stack = 1 if kind == "vector" else 3
+    space = observation_space(stack, as_dict, dtype)
+    sb3_class = DictReplayBuffer if as_dict else ReplayBuffer if n_steps == 1 else NStepReplayBuffer
+    kwargs: dict[str, Any] = {"n_steps": n_steps, "gamma": 0.9} if n_steps > 1 else {}
+    kwargs["handle_timeout_termination"] = handle_timeout_termination
+    theirs = sb3_class(50, space, ACTIONS, "cpu", n_envs=3, **kwargs)
+    ours = make_buffer(50, 3, stack, as_dict, dtype, **kwargs)
+    normalize = VecNormalize(DummyVecEnv([lambda: Shown(space)]), norm_obs_keys=["state"] if as_dict else None)
+    for rms in normalize.obs_rms.values() if as_dict else [normalize.obs_rms]:
+        rms.mean, rms.var = rms.mean + 3, rms.var * 5
+    normalize.ret_rms.var = np.float64(7)
+
+    envs = [trajectory(env, LIFE[env:] + LIFE[:env], stack, "zeros", as_dict, dtype) for env in range(3)]
+    for n_added in range(1, 75):
+        steps = [next(env) for env in envs]
+        for buffer in (theirs, ours):
+            buffer.add(*transition(steps))
+        assert (ours.size(), ours.pos, ours.full) == (theirs.size(), theirs.pos, theirs.full)
+        if n_added in (1, 15, 16, 17, 40, 74):
+            assert_same_samples(ours, theirs)
+            assert_same_samples(ours, theirs, normalize)
+    for key in ("actions", "rewards", "dones", "timeouts"):
+        assert_same(getattr(ours, key), getattr(theirs, key))
+    if not as_dict:
+        assert_same(ours.observations, theirs.observations)
+        assert_same(ours.next_observations[3:9, 1, 0], theirs.next_observations[3:9, 1, 0])
+        assert_same(ours.next_observations[..., 0], theirs.next_observations[..., 0])
+
+    windows = []
+    for vec_normalize in (None, normalize):
+        np.random.seed(0)
+        windows.append(ours.sample_windows(20, 3, env=vec_normalize))
+    plain, normalized = windows
+    observations = plain.observations
+    plain_arrays = {key: value.numpy() for key, value in observations.items()} if as_dict else observations.numpy()
+    assert_same(normalized.observations, normalize.normalize_obs(plain_arrays))
+    assert_same(normalized.rewards, normalize.normalize_reward(plain.rewards.numpy()))
+
+
+def test_extend_and_reset_as_sb3_does():
+    theirs, ours = ReplayBuffer(30, observation_space(2), ACTIONS, "cpu", n_envs=2), make_buffer(30, 2, stack=2)
+    for n_added, first in ((11, 0), (22, 2)):
+        envs = [trajectory(env, LIFE[first + env :], 2, "zeros") for env in range(2)]
+        rows = [transition([next(env) for env in envs]) for _ in range(n_added)]
+        for buffer in (theirs, ours):
+            buffer.extend(*zip(*rows, strict=True))
+        assert ours.size() == theirs.size() == min(n_added, 15)
+        assert_same_samples(ours, theirs)
+        for buffer in (theirs, ours):
+            buffer.reset()
+        assert ours.size() == theirs.size() == 0
+        with pytest.raises(NoWindowError):
+            ours.sample_windows(1, 1)
+    # What was there before is not taken for the begin of what comes now.
+    check_windows(ours, filled(ours, 13, LIFE, stack=2, padding="repeat"), 3)
+
+
+def through_pickle(buffer: WindowReplayBuffer) -> WindowReplayBuffer:
+    return pickle.loads(pickle.dumps(buffer))
+
+
+def through_sb3(buffer: WindowReplayBuffer) -> WindowReplayBuffer:
+    file = io.BytesIO()
+    save_to_pkl(file, buffer)
+    file.seek(0)
+    return load_from_pkl(file)
+
+
+@pytest.mark.parametrize("again", [through_pickle, through_sb3, copy.deepcopy])
+@pytest.mark.parametrize("n_added", [5, 10, 43])
+def test_saved_and_loaded_it_goes_on_as_if_nothing_had_happened(again, n_added):
+    buffer = make_buffer(40, 2, stack=3, as_dict=True)
+    envs = [trajectory(env, LIFE[env:], 3, "zeros", True) for env in range(2)]
+    for _ in range(n_added):
+        buffer.add(*transition([next(env) for env in envs]))
+    loaded = again(buffer)
+    assert loaded.stores["pixels"].frames is not buffer.stores["pixels"].frames
+    assert_same_samples(loaded, buffer)
+    assert_same_windows(loaded, buffer, 3)
+    for _ in range(30):
+        rows = transition([next(env) for env in envs])
+        buffer.add(*rows)
+        loaded.add(*rows)
+    assert_same_samples(loaded, buffer)
+    assert_same_windows(loaded, buffer, 3)
+
+
+def measured_bytes(holder: Any) -> int:
+    """All bytes of the arrays that an object holds, however deep."""
+    if isinstance(holder, np.ndarray):
+        return holder.nbytes
+    if isinstance(holder, dict):
+        return sum(measured_bytes(part) for part in holder.values())
+    if isinstance(holder, (list, tuple)):
+        return sum(measured_bytes(part) for part in holder)
+    return measured_bytes(vars(holder)) if hasattr(holder, "__dict__") and not isinstance(holder, (type, spaces.Space)) else 0
+
+
+def test_memory_of_stacked_images():
+    space = spaces.Box(0, 255, (9, 100, 100), np.uint8)
+    buffer = WindowReplayBuffer(2000, space, ACTIONS, "cpu", frame_stack=3)
+    rng = np.random.default_rng(0)
+    for i in range(2250):
+        if i % 250 == 0:
+            frames = [rng.integers(256, size=(3, 100, 100), dtype=np.uint8)] * 3
+        obs = np.concatenate(frames)[None]
+        frames = [*frames[1:], rng.integers(256, size=(3, 100, 100), dtype=np.uint8)]
+        truncated = i % 250 == 249
+        info = {"TimeLimit.truncated": truncated}
+        buffer.add(obs, np.concatenate(frames)[None], np.zeros((1, 2)), np.zeros(1), np.array([truncated]), [info])
+    assert measured_bytes(buffer) / buffer.size() <= 32_000
+
+
+def test_memory_of_states_and_of_last_observations():
+    wide = spaces.Box(-1, 1, (60,), np.float32)
+    theirs, ours = (cls(5000, wide, ACTIONS, "cpu") for cls in (ReplayBuffer, WindowReplayBuffer))
+    obs = np.zeros((1, 60), np.float32)
+    for i in range(20_000):
+        done = np.array([i % 100 == 99])
+        following = obs + 1
+        for buffer in (theirs, ours):
+            buffer.add(obs, following, np.zeros((1, 2)), np.zeros(1), done, [{}])
+        obs = -following if done[0] else following
+    both = theirs.observations.nbytes + theirs.next_observations.nbytes
+    assert measured_bytes(ours.stores) < 0.55 * both
+    # The places of last observations are used again as the ring goes round.
+    assert 50 <= ours.stores[""].final_frames.shape[0] <= 128
+
+
+def test_what_is_sampled_is_not_the_buffer_itself():
+    buffer = make_buffer(20, stack=2)
+    history = filled(buffer, 20, [(9, "truncated")], stack=2, padding="repeat")
+    for _ in range(2):
+        check_windows(buffer, history, 2)
+        for part in buffer.sample_windows(50, 2):
+            part.zero_()
+        for part in buffer.sample(50)[:5]:
+            part.zero_()
+
+
+def steps_of(stack: int, padding: str = "repeat", as_dict: bool = False, n_envs: int = 1) -> list[list[Step]]:
+    envs = [trajectory(env, [(6, "terminated")], stack, padding, as_dict) for env in range(n_envs)]
+    return [[next(env) for env in envs] for _ in range(20)]
+
+
+@pytest.mark.parametrize("as_dict", [False, True])
+@pytest.mark.parametrize(
+    "fault, problem",
+    [
+        ("newest first", "the next observation is not the last one plus one new frame"),
+        ("begins with others", "an episode begins neither with one frame repeated nor with zeros"),
+        ("a frame left out", "the next observation is not the last one plus one new frame"),
+    ],
+)
+@pytest.mark.parametrize("n_before", [0, 3, 6, 12])
+def test_stacks_that_frames_do_not_make_are_refused(fault, problem, as_dict, n_before):
+    buffer = make_buffer(10, 2, stack=3, as_dict=as_dict)
+    rows = steps_of(3, as_dict=as_dict, n_envs=2)
+    for steps in rows[:n_before]:
+        buffer.add(*transition(steps))
+    obs, next_obs, *rest = copy.deepcopy(transition(rows[n_before]))
+    stacks = [part["pixels"] if as_dict else part for part in (obs, next_obs)]
+    if fault == "newest first":
+        # The first env is all right, the second is not.
+        for stack in stacks:
+            stack[1] = stack[1].reshape(3, *FRAME)[::-1].reshape(stack[1].shape)
+        if n_before == 3:
+            # Inside of an episode this looks like a reset by hand.
+            problem = "an episode begins neither with one frame repeated nor with zeros"
+    elif fault == "begins with others":
+        stacks[0][1] = np.arange(stacks[0][1].size).reshape(stacks[0][1].shape)
+    else:
+        stacks[1][1] = np.concatenate([stacks[1][1, 2:], stacks[1][1, :2]])
+    before = pickle.dumps(buffer)
+    with pytest.raises(ValueError, match=problem) as error:
+        buffer.add(obs, next_obs, *rest)
+    for named in ("frame_stack=3", "FrameStackObservation", "VecFrameStack", "env 1", f"transition {n_before}"):
+        assert named in str(error.value)
+    assert ("'pixels'" in str(error.value)) == as_dict
+    # Nothing was added: what comes next finds the buffer as it was.
+    assert pickle.dumps(buffer) == before
+    for steps in rows[n_before:]:
+        buffer.add(*transition(steps))
+    check_windows(buffer, [[row[env] for row in rows] for env in range(2)], 2)
+
+
+@pytest.mark.parametrize("wrong", ["action", "reward", "done", "obs"])
+def test_a_part_of_a_wrong_shape_leaves_the_buffer_as_it_was(wrong):
+    buffer = make_buffer(6, stack=2)
+    rows = steps_of(2)
+    for steps in rows[:9]:
+        buffer.add(*transition(steps))
+    before = pickle.dumps(buffer)
+    parts = list(transition(rows[9]))
+    position = ["obs", "next_obs", "action", "reward", "done"].index(wrong)
+    parts[position] = np.zeros(7)
+    with pytest.raises(ValueError, match="reshape"):
+        buffer.add(*parts)
+    assert pickle.dumps(buffer) == before
+
+
+def test_horizons_and_offsets_that_cannot_be():
+    buffer = make_buffer(30)
+    filled(buffer, 25, [(4, "truncated"), (5, "terminated")], stack=1, padding="repeat")
+    assert buffer.sample_windows(3, 5).actions.shape == (3, 5, 2)
+    for horizon in (6, 31, 1000):
+        with pytest.raises(NoWindowError, match=f"no episode in the replay buffer spans {horizon} agent steps"):
+            buffer.sample_windows(3, horizon)
+    for horizon in (0, -1):
+        with pytest.raises(ValueError, match="at least 1") as error:
+            buffer.sample_windows(3, horizon)
+        assert not isinstance(error.value, NoWindowError)
+    for offsets in ([0, 4], [-1]):
+        with pytest.raises(ValueError, match="not all in 0 to 3"):
+            buffer.sample_windows(3, 3, offsets=offsets)
+
+
+@pytest.mark.parametrize(
+    "space, kwargs, message",
+    [
+        (observation_space(2), {"frame_stack": 3}, "frame_stack=3 does not divide"),
+        (observation_space(2), {"frame_stack": 0}, "frame_stack=0"),
+        (spaces.Discrete(4), {"frame_stack": 2}, "frame_stack=2 does not divide"),
+        (observation_space(2, True), {"frame_stack": {"pixel": 2}}, "names keys that observations do not have"),
+        (observation_space(1, True), {"n_steps": 3}, "n_steps=3"),
+    ],
+)
+def test_settings_that_cannot_be(space, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        WindowReplayBuffer(10, space, ACTIONS, "cpu", **kwargs)
+
+
+@pytest.mark.parametrize("stack", [1, 3])
+def test_a_reset_by_hand_begins_a_new_episode(stack):
+    buffer = make_buffer(40, stack=stack, n_steps=3)
+    histories = filled(buffer, 24, [(5, "by hand"), (8, "terminated")], stack=stack, padding="repeat")
+    check_windows(buffer, histories, 2)
+    # 5 + 8 + 5 + 6 steps.
+    for horizon, n_windows in ((5, 1 + 4 + 1 + 2), (8, 1), (9, 0)):
+        assert len(whole_windows(histories, 40, horizon)) == n_windows
+        check_windows(buffer, histories, horizon)
+    # n-step returns do not cross it either, and they bootstrap from what came last.
+    np.random.seed(0)
+    batch = buffer.sample(300)
+    for env_number, reward, done, obs in zip(batch.actions, batch.rewards, batch.dones, batch.next_observations, strict=True):
+        number = int(env_number[1])
+        steps = [step for step in histories[0][number : number + 3] if step.episode == histories[0][number].episode]
+        np.testing.assert_allclose(reward, sum(0.99**i * step.reward for i, step in enumerate(steps)), rtol=1e-6)
+        assert bool(done) == steps[-1].done
+        assert_same(obs, steps[-1].next_obs)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float64, np.int64])
+def test_other_data_types(dtype):
+    buffer = make_buffer(20, 2, stack=2, dtype=dtype)
+    check_windows(buffer, filled(buffer, 33, LIFE, stack=2, padding="zeros", dtype=dtype), 3)
+
+
+def test_nan_is_no_new_episode():
+    buffer = WindowReplayBuffer(20, VECTOR, ACTIONS, "cpu", frame_stack=3)
+    observations = np.arange(11, dtype=np.float32)[:, None] + np.arange(-2, 1, dtype=np.float32)
+    observations[0] = np.nan
+    observations[1:3] = np.array([[np.nan, np.nan, 1], [np.nan, 1, 2]])
+    for t in range(10):
+        buffer.add(observations[t][None], observations[t + 1][None], np.zeros((1, 2)), np.array([t]), np.array([False]), [{}])
+    window = buffer.sample_windows(1, 10)
+    assert_same(window.observations[0], observations)
+    assert_same(window.rewards[0, :, 0], np.arange(10, dtype=np.float32))
+
+
+@pytest.mark.parametrize("space", [spaces.Box(-9, 99, (), np.float32), spaces.Discrete(99), spaces.MultiDiscrete([99, 9])])
+def test_observations_that_are_no_vectors(space):
+    buffer = WindowReplayBuffer(10, space, ACTIONS, "cpu", n_envs=2)
+    for t in range(14):
+        obs, next_obs = (np.full((2, *space.shape), i, space.dtype) for i in (t, t + 1))
+        buffer.add(obs, next_obs, np.zeros((2, 2)), np.full(2, t), np.zeros(2, bool), [{}, {}])
+    window = buffer.sample_windows(40, 5)
+    assert set(window.rewards.unique().tolist()) == {9, 10, 11, 12, 13}
+    shown = window.observations.reshape(40, 6, -1)[:, :, 0]
+    assert_same(shown, np.tile(np.arange(9, 15), (40, 1)).astype(space.dtype))
+
+
+def image_env(n_frames: int = 1) -> gym.Env:
+    env: gym.Env = Shown(IMAGE)
+    if n_frames > 1:
+        # (stack, height, width, channels) to (height, width, stack * channels), as SB3 wants images.
+        env = FrameStackObservation(env, n_frames)
+        shape = (*IMAGE.shape[:2], n_frames * IMAGE.shape[2])
+        env = TransformObservation(
+            env, lambda frames: np.moveaxis(frames, 0, 2).reshape(shape), spaces.Box(0, 255, shape, np.uint8)
+        )
+    return env
+
+
+def vector_env() -> gym.Env:
+    return FlattenObservation(FrameStackObservation(Shown(VECTOR), 3))
+
+
+TABLE = spaces.Box(-1, 1, (4, 5), np.float32)
+BOTH = spaces.Dict({"image": IMAGE, "state": VECTOR, "table": TABLE})
+
+
+@pytest.mark.parametrize(
+    "make_env, expected",
+    [
+        (lambda: DummyVecEnv([lambda: Shown(VECTOR)]), 1),
+        (lambda: VecTransposeImage(DummyVecEnv([image_env])), 1),
+        (lambda: VecTransposeImage(DummyVecEnv([lambda: image_env(4)] * 2)), 4),
+        (lambda: VecTransposeImage(VecFrameStack(DummyVecEnv([image_env] * 2), 3)), 3),
+        (lambda: VecFrameStack(VecTransposeImage(DummyVecEnv([image_env])), 3), 3),
+        (lambda: VecNormalize(VecFrameStack(DummyVecEnv([lambda: Shown(VECTOR)]), 2)), 2),
+        (lambda: VecNormalize(VecFrameStack(VecTransposeImage(DummyVecEnv([image_env])), 3), clip_obs=1e6), 3),
+        (lambda: DummyVecEnv([lambda: FrameStackObservation(Shown(VECTOR), 3)]), 3),
+        (lambda: DummyVecEnv([lambda: FrameStackObservation(Shown(VECTOR), 3, padding_type="zero")]), 3),
+        (lambda: DummyVecEnv([vector_env]), 3),
+        # The outer stack's frames are the inner stacks.
+        (
+            lambda: VecFrameStack(DummyVecEnv([vector_env]), 2),
+            2,
+        ),
+        # VecFrameStack takes the last axis of what is neither a vector nor an image.
+        (lambda: VecFrameStack(DummyVecEnv([lambda: Shown(TABLE)]), 2), 1),
+        (lambda: VecFrameStack(DummyVecEnv([lambda: Shown(TABLE)]), 2, channels_order="first"), 2),
+        (
+            lambda: VecTransposeImage(VecFrameStack(DummyVecEnv([lambda: Shown(BOTH)]), 2)),
+            {"image": 2, "state": 2, "table": 1},
+        ),
+        (lambda: DummyVecEnv([lambda: Shown(BOTH)]), {"image": 1, "state": 1, "table": 1}),
+    ],
+)
+def test_detected_stacks_fit_what_the_wrappers_give(make_env, expected):
+    env = make_env()
+    stack = detect_frame_stack(env)
+    assert stack == expected
+    ours = WindowReplayBuffer(30, env.observation_space, ACTIONS, "cpu", n_envs=env.num_envs, frame_stack=stack)
+    sb3_class = DictReplayBuffer if isinstance(env.observation_space, spaces.Dict) else ReplayBuffer
+    theirs = sb3_class(30, env.observation_space, ACTIONS, "cpu", n_envs=env.num_envs)
+
+    def original(normalized: Obs) -> Obs:
+        return copy.deepcopy(env.get_original_obs() if isinstance(env, VecNormalize) else normalized)
+
+    obs = original(env.reset())
+    for _ in range(40):
+        actions = np.zeros((env.num_envs, 2), np.float32)
+        now, rewards, dones, infos = env.step(actions)
+        new_obs = original(now)
+        next_obs = copy.deepcopy(new_obs)
+        for i in np.flatnonzero(dones):
+            last = infos[i]["terminal_observation"]
+            last = env.unnormalize_obs(last) if isinstance(env, VecNormalize) else last
+            if isinstance(next_obs, dict):
+                for key in next_obs:
+                    next_obs[key][i] = last[key]
+            else:
+                next_obs[i] = last
+        for buffer in (theirs, ours):
+            buffer.add(obs, next_obs, actions, rewards, dones, infos)
+        obs = new_obs
+    if isinstance(env, VecNormalize):
+        # The last observation of an episode came back from VecNormalize, rounded; images lose what is behind the point.
+        tolerance = 1 if obs.dtype == np.uint8 else 1e-5
+        assert_same(ours.observations, theirs.observations)
+        np.testing.assert_allclose(ours.next_observations, theirs.next_observations, rtol=0, atol=tolerance)
+    else:
+        assert_same_samples(ours, theirs)
