@@ -347,6 +347,26 @@ def test_extend_and_reset_as_sb3_does():
     check_windows(ours, filled(ours, 13, LIFE, stack=2, padding="repeat"), 3)
 
 
+def test_what_was_before_a_reset_is_gone_even_inside_of_an_episode():
+    buffer = make_buffer(20)
+    env = trajectory(0, [(30, "truncated")], 1, "repeat")
+    steps = [next(env) for _ in range(12)]
+    for step in steps[:8]:
+        buffer.add(*transition([step]))
+    buffer.reset()
+    for step in steps[8:]:
+        buffer.add(*transition([step]))
+    for horizon in (1, 4, 5):
+        check_windows(buffer, [steps[8:]], horizon)
+
+
+def test_many_short_episodes():
+    buffer = make_buffer(200, 2, stack=2)
+    histories = filled(buffer, 180, [(1, "terminated"), (2, "truncated"), (1, "by hand")], stack=2, padding="zeros")
+    for horizon in (1, 2):
+        check_windows(buffer, histories, horizon)
+
+
 def through_pickle(buffer: WindowReplayBuffer) -> WindowReplayBuffer:
     return pickle.loads(pickle.dumps(buffer))
 
