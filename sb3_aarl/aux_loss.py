@@ -172,12 +172,12 @@ class AuxLoss:
 
         Windows are drawn uniformly from an episode, so two losses with one canonical form are one loss.
         """
-        start = min(token.offset for token in self.source_tokens + self.target_tokens)
-        source, target = (
-            [Token(token.kind, token.offset - start) for token in tokens]
-            for tokens in (self.source_tokens, self.target_tokens)
-        )
-        return AuxLoss.from_tokens(source, target, self.operator, self.negatives)
+        chosen = [i for i, bits in enumerate(zip(self.source, self.target, strict=True)) if any(bits)]
+        first = chosen[0] // 3 * 3
+        horizon = max(1, -(-(chosen[-1] - first) // 3))  # state i closes step i, action and reward i lie in step i + 1
+        # A state at the very end, alone, has no step behind it.
+        source, target = ((mask[first:] + (False,) * 3)[: 3 * horizon + 1] for mask in (self.source, self.target))
+        return AuxLoss(horizon, source, target, self.operator, self.negatives)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for YAML and JSON; ``AuxLoss.from_dict`` reads them."""

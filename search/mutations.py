@@ -1,0 +1,79 @@
+"""The paper's mutations of an auxiliary loss (section 2.2, figure 3, A.3), as pure functions."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_aarl.aux_loss import AuxLoss
+from search.space import MAX_HORIZON, Bits, is_valid, random_operator
+
+
+class RejectedLoss(ValueError):
+    """What a mutation gave is no valid loss (paper, A.3: it is drawn again)."""
+
+
+def _build(horizon: int, source: Bits, target: Bits, operator: str, negatives: bool) -> AuxLoss:
+    if not is_valid(source, target):
+        raise RejectedLoss(f"no state in the source {source}, or an empty target {target}")
+    return AuxLoss(horizon, source, target, operator, negatives)
+
+
+def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str] | None = None) -> AuxLoss:
+    """
+    Flip each bit of both masks with probability 1 / (2 (3k + 1)), k being the horizon, independently.
+
+    :param loss: The parent
+    :param rng: Source of randomness
+    :param operators: Operators that are searched too (the paper does not say how): with the same probability each, the
+        operator is drawn anew and negatives are switched; None to keep both
+    :raises RejectedLoss: when the offspring is not valid
+    """
+    flip_rate = 1 / (2 * (3 * loss.horizon + 1))
+    flips = rng.random((2, 3 * loss.horizon + 1)) < flip_rate
+    source, target = (np.array((loss.source, loss.target)) ^ flips).tolist()
+    operator, negatives = loss.operator, loss.negatives
+    if operators is not None:
+        operator = random_operator(rng, operators)[0] if rng.random() < flip_rate else operator
+        negatives ^= bool(rng.random() < flip_rate)
+    return _build(loss.horizon, tuple(source), tuple(target), operator, negatives)
+
+
+def crossover(loss: AuxLoss, other: AuxLoss, rng: np.random.Generator) -> AuxLoss:
+    """
+    Take each bit of both masks, and the operator, from one of two parents at random.
+
+    :param loss: One parent
+    :param other: Another of the same horizon
+    :param rng: Source of randomness
+    :raises RejectedLoss: when the offspring is not valid
+    :raises ValueError: when the horizons differ
+    """
+    if loss.horizon != other.horizon:
+        raise ValueError(f"crossover needs parents of one horizon, not of {loss.horizon} and {other.horizon}")
+    from_other = rng.random((2, 3 * loss.horizon + 1)) < 0.5
+    source, target = np.where(from_other, (other.source, other.target), (loss.source, loss.target)).tolist()
+    operator = loss if rng.random() < 0.5 else other
+    return _build(loss.horizon, tuple(source), tuple(target), operator.operator, operator.negatives)
+
+
+def horizon_change(loss: AuxLoss, rng: np.random.Generator, max_horizon: int = MAX_HORIZON) -> AuxLoss:
+    """
+    Drop the last step (action, reward, state) of both masks, or append three random bits to each.
+
+    Both ways are equally probable; at the ends of 1..max_horizon only one is left.
+
+    :param loss: The parent
+    :param rng: Source of randomness
+    :param max_horizon: Longest horizon of the space
+    :raises RejectedLoss: when the offspring is not valid, or the space has one horizon only
+    """
+    ways = [change for change in (-1, 1) if 1 <= loss.horizon + change <= max_horizon]
+    if not ways:
+        raise RejectedLoss(f"the horizon of {loss} cannot change between 1 and {max_horizon}")
+    change = ways[rng.integers(len(ways))]
+    if change < 0:
+        source, target = loss.source[:-3], loss.target[:-3]
+    else:
+        added = (rng.random((2, 3)) < 0.5).tolist()
+        source, target = loss.source + tuple(added[0]), loss.target + tuple(added[1])
+    return _build(loss.horizon + change, source, target, loss.operator, loss.negatives)

@@ -1,0 +1,642 @@
+"""AuxLossSampler: the paper's evolution of auxiliary losses (section 2.2, A.3) as a sampler of Optuna."""
+
+import contextlib
+import logging
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from optuna.distributions import BaseDistribution
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.samplers import RandomSampler
+from optuna.samplers._ga import BaseGASampler
+from optuna.study import Study, StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from sb3_aarl.aux_loss import AuxLoss
+from search import mutations, space, workers
+from search.space import MAX_HORIZON, check_operators
+from search.token_model import TokenModel
+
+logger = logging.getLogger(__name__)
+
+# System attributes of a trial. The place is written once, in one piece, and is what gives the trial its candidate.
+PLACE_KEY = "AuxLossSampler:place"
+REJECTED_KEY = "AuxLossSampler:rejected"
+# A trial without a place shows with this user attribute that its worker still waits for one.
+WAITING_KEY = "waiting"
+SETTINGS_KEY = "AuxLossSampler:settings"
+
+# Draws for one place before a duplicate is accepted: only very small spaces run out of new losses.
+MAX_DRAWS = 300
+# How often a candidate is given out again after its worker died, before it is taken for the cause.
+MAX_DEATHS = 3
+# Seconds without a sign of life after which a trial that never got a place is given up.
+ORPHAN_SECONDS = 60.0
+
+OCCUPYING = (TrialState.RUNNING, TrialState.WAITING, TrialState.COMPLETE, TrialState.PRUNED)
+FILLED = (TrialState.COMPLETE, TrialState.PRUNED)
+
+
+class SearchComplete(RuntimeError):
+    """All places of the last stage are filled."""
+
+
+class Candidate(NamedTuple):
+    """
+    A loss for one place of a stage.
+
+    :param loss: The loss
+    :param operation: ``random``, ``prior``, ``replacement``, ``crossover`` or ``horizon_change``
+    :param parents: Numbers of the trials that it stems from
+    """
+
+    loss: AuxLoss
+    operation: str
+    parents: tuple[int, ...] = ()
+
+
+class StageProgress(NamedTuple):
+    """
+    :param stage: Number of the stage, from 1
+    :param places: How many candidates it has
+    :param filled: Places whose trial is complete or pruned
+    :param running: Places whose trial runs
+    :param failed: Failed trials so far
+    """
+
+    stage: int
+    places: int
+    filled: int
+    running: int
+    failed: int
+
+
+class _Register:
+    """What the storage says of the places; each refresh reads trials that are new or were not finished before."""
+
+    def __init__(self) -> None:
+        self.trials: Sequence[FrozenTrial] = ()
+        self.open: set[int] = set()  # numbers of trials that are not finished
+        self.holders: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
+        self._placed: set[int] = set()
+
+    def refresh(self, trials: Sequence[FrozenTrial]) -> None:
+        changed = [*sorted(self.open), *range(len(self.trials), len(trials))]
+        self.trials = trials
+        for number in changed:
+            trial = trials[number]
+            place = trial.system_attrs.get(PLACE_KEY)
+            if place is not None and number not in self._placed:
+                self._placed.add(number)
+                self.holders[place["stage"], place["place"]].append(number)
+            (self.open.discard if trial.state.is_finished() else self.open.add)(number)
+
+    def holder(self, stage: int, place: int) -> FrozenTrial | None:
+        """The trial that has the place, running or finished; None where all failed or there was none."""
+        for number in reversed(self.holders.get((stage, place), ())):
+            if self.trials[number].state in OCCUPYING:
+                return self.trials[number]
+        return None
+
+    def attempt(self, stage: int, place: int) -> int:
+        """How many candidates of the place were given up because they failed."""
+        attempt = deaths = 0
+        for number in sorted(self.holders.get((stage, place), ())):
+            trial = self.trials[number]
+            if trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted"):
+                # Without the mark of a live worker it was the worker that died: the same candidate has another try.
+                deaths += 1
+                if REJECTED_KEY in trial.system_attrs or deaths > MAX_DEATHS:
+                    attempt, deaths = attempt + 1, 0
+        return attempt
+
+    def unplaced_before(self, number: int) -> list[FrozenTrial]:
+        """Trials before this one that run and may still ask for a place."""
+        return [
+            self.trials[other]
+            for other in sorted(self.open)
+            if other < number
+            and other not in self._placed
+            and self.trials[other].state == TrialState.RUNNING
+            and not self.trials[other].params  # one with parameters comes from another sampler
+        ]
+
+
+class AuxLossSampler(BaseGASampler):
+    """
+    Evolution of auxiliary losses with the paper's mutations, for ``suggest_aux_loss``.
+
+    The first stage draws ``n_random`` losses at random and ``n_prior`` from two priors. Each later stage takes the
+    best ``parents`` of the one before and fills its ``population_size`` places in fixed shares: ``replacement``,
+    ``crossover``, ``horizon_change``, ``random``. A stage has places, and each is filled by one completed (or pruned)
+    trial, however many workers there are; a failed trial frees its place. The random places of the next stage need no
+    parents and are given out while the last trials of this stage run. A worker that finds no place waits for one.
+
+    The candidate of a place depends on the seed, the stage, the place and the stages before only, whichever worker
+    asks. Workers agree on places through the storage alone: trial n chooses after all trials before it have chosen.
+
+    :param population_size: Places of every stage but the first (paper: 100)
+    :param n_random: Random losses of the first stage (paper: 100)
+    :param n_prior: Losses of the first stage from the priors, both in turn (paper: 25)
+    :param parents: Share of a stage that the next one stems from (paper: 0.25)
+    :param replacement: Share of flipped masks (paper: 0.5)
+    :param crossover: Share of crossovers (paper: 0.2). Where no two parents have one horizon, the partner is any of the
+        stage; where there is none either, the place gets a replacement
+    :param horizon_change: Share of changed horizons (paper: 0.1)
+    :param random: Share of random losses (paper: 0.2)
+    :param max_horizon: Longest horizon (paper: 10)
+    :param operators: Operators to search too, as in ``suggest_aux_loss``; None for mean squared error (paper, 2.2)
+    :param allow_duplicates: Whether a loss may be trained again, as in the paper; else a candidate whose canonical
+        form the search had already is drawn again
+    :param seed: Seed of the evolution. None for a random one, kept in the study; a study keeps its first seed
+    :param screening: Offspring that are drawn for each place, of which the one is kept that a Bayesian linear model of
+        the tokens, fitted to the stages before, rates highest under one posterior draw; 1 for the paper's evolution
+    :param n_stages: Number of stages, after which ``ask`` raises :class:`SearchComplete`; None for no end
+    :param worker: Identity of this process (``workers.identity()``). Places of a worker of this machine that has died
+        are given out again. None where trials are told by another process than the one that asked
+    :raises ValueError: naming the argument that does not fit
+    """
+
+    def __init__(
+        self,
+        population_size: int = 100,
+        n_random: int = 100,
+        n_prior: int = 25,
+        parents: float = 0.25,
+        replacement: float = 0.5,
+        crossover: float = 0.2,
+        horizon_change: float = 0.1,
+        random: float = 0.2,
+        max_horizon: int = MAX_HORIZON,
+        operators: Sequence[str] | None = None,
+        allow_duplicates: bool = False,
+        seed: int | None = None,
+        screening: int = 1,
+        n_stages: int | None = None,
+        worker: str | None = None,
+    ):
+        super().__init__(population_size)
+        positive = {"population_size": population_size, "max_horizon": max_horizon, "screening": screening}
+        positive |= {"n_random + n_prior": n_random + n_prior, "n_stages": 1 if n_stages is None else n_stages}
+        for name, value in positive.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, not {value}")
+        shares = {"random": random, "replacement": replacement, "crossover": crossover, "horizon_change": horizon_change}
+        for name, share in {**shares, "n_random": n_random, "n_prior": n_prior}.items():
+            if share < 0:
+                raise ValueError(f"{name} must not be negative, not {share}")
+        if abs(sum(shares.values()) - 1) > 1e-9:
+            raise ValueError(f"the shares {', '.join(shares)} must sum to 1, not {sum(shares.values())}")
+        if not 0 < parents <= 1:
+            raise ValueError(f"parents must be a share in (0, 1], not {parents}")
+        check_operators(operators)
+        self.n_random = n_random
+        self.n_prior = n_prior
+        self.parents = parents
+        self.shares = shares
+        self.max_horizon = max_horizon
+        self.operators = None if operators is None else tuple(operators)
+        self.allow_duplicates = allow_duplicates
+        self.seed = seed
+        self.screening = screening
+        self.n_stages = n_stages
+        self.worker = worker
+        # Operations place by place: what needs no parents comes first, so that it can be given out early.
+        prior = ["prior"] * n_prior
+        self._first_operations = ["random"] * n_random + prior
+        counts = _apportion(shares, population_size)
+        self._operations = [name for name in shares for _ in range(counts[name])]
+        self._other_params = RandomSampler(seed)
+        self._reset()
+
+    def _reset(self) -> None:
+        self._lock = threading.Lock()
+        self._study: tuple[Any, int] | None = None
+        self._register = _Register()
+        self._evolution: _Evolution | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        derived = ("_lock", "_study", "_register", "_evolution")
+        return {key: value for key, value in self.__dict__.items() if key not in derived}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._reset()
+
+    def operations(self, stage: int) -> list[str]:
+        """
+        The operation of every place of a stage.
+
+        :param stage: Number of the stage, from 1
+        """
+        return self._first_operations if stage == 1 else self._operations
+
+    def progress(self, study: Study) -> list[StageProgress]:
+        """
+        How far each stage is that has begun, or all of them where ``n_stages`` is known.
+
+        :param study: The study
+        """
+        with self._lock:
+            self._refresh(study)
+            register = self._register
+            last = self.n_stages or max((stage for stage, _ in register.holders), default=1)
+            progress = []
+            for stage in range(1, last + 1):
+                places = len(self.operations(stage))
+                holders = [register.holder(stage, place) for place in range(places)]
+                states = [holder.state for holder in holders if holder is not None]
+                filled = sum(state in FILLED for state in states)
+                tried = [number for place in range(places) for number in register.holders.get((stage, place), ())]
+                failed = sum(register.trials[number].state == TrialState.FAIL for number in tried)
+                progress.append(StageProgress(stage, places, filled, len(states) - filled, failed))
+            return progress
+
+    def has_place(self, study: Study) -> bool:
+        """
+        Whether a trial that is asked for now would get a place without waiting.
+
+        :param study: The study
+        :raises SearchComplete: when all places of the last stage are filled
+        """
+        with self._lock:
+            self._refresh(study)
+            # Before the first trial chose, the seed of the study may still be open.
+            return not self._register.holders or self._first_free(study) is not None
+
+    # Optuna's interface.
+
+    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
+        """Give the trial a place. Waits for one where there is none, and for trials before it that still choose."""
+        self._raise_error_if_multi_objective(study)
+        if PLACE_KEY in trial.system_attrs:
+            return  # a copy of a trial whose worker died, which keeps its place
+        try:
+            if self.worker is not None:
+                study._storage.set_trial_user_attr(trial._trial_id, workers.WORKER_KEY, self.worker)
+            self._find_place(study, trial)
+        except BaseException:
+            # Interrupted while it waited, or nothing is left to do.
+            with contextlib.suppress(UpdateFinishedTrialError):
+                study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+            raise
+
+    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        return space.distributions(self._candidate_loss(study, trial).horizon, self.max_horizon, self.operators)
+
+    def sample_relative(self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]) -> dict[str, Any]:
+        return space.loss_to_params(self._candidate_loss(study, trial), self.operators)
+
+    def sample_independent(
+        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+    ) -> Any:
+        return self._other_params.sample_independent(study, trial, param_name, param_distribution)
+
+    def reseed_rng(self) -> None:
+        self._other_params.reseed_rng()
+
+    def after_trial(self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None) -> None:
+        """Mark a candidate that failed in a live worker: its place gets another one."""
+        if state == TrialState.FAIL and not trial.user_attrs.get("interrupted"):
+            study._storage.set_trial_system_attr(trial._trial_id, REJECTED_KEY, True)
+
+    def get_trial_generation(self, study: Study, trial: FrozenTrial) -> int:
+        """The trial's stage, counted from 0 as in Optuna; -1 for a trial without a place."""
+        place = study._storage.get_trial(trial._trial_id).system_attrs.get(PLACE_KEY)
+        return -1 if place is None else place["stage"] - 1
+
+    def get_population(self, study: Study, generation: int) -> list[FrozenTrial]:
+        """Finished trials of a stage (from 0), in the order of places."""
+        with self._lock:
+            self._refresh(study)
+            return self._population(generation + 1)
+
+    def select_parent(self, study: Study, generation: int) -> list[FrozenTrial]:
+        """The parents of a stage (from 0): the best of the one before, the best first."""
+        return self._best(study, self.get_population(study, generation - 1))
+
+    # Places.
+
+    def _refresh(self, study: Study) -> None:
+        storage, study_id = study._storage, study._study_id
+        if self._study is None or self._study[0] is not storage or self._study[1] != study_id:
+            self._check_settings(study)
+            self._study = (storage, study_id)
+            self._register = _Register()
+            self._evolution = None
+        # Not study.get_trials: a pruner may have wrapped the study so that it shows some of the trials only.
+        self._register.refresh(storage.get_all_trials(study_id, deepcopy=False))
+
+    def _check_settings(self, study: Study) -> None:
+        """Refuse to go on with a study that was begun with other settings: its places mean something else."""
+        settings = {
+            "population_size": self.population_size,
+            "n_random": self.n_random,
+            "n_prior": self.n_prior,
+            "parents": self.parents,
+            **self.shares,
+            "max_horizon": self.max_horizon,
+            "operators": None if self.operators is None else list(self.operators),
+            "allow_duplicates": self.allow_duplicates,
+            "screening": self.screening,
+        }
+        begun = study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY)
+        if begun is None:
+            study._storage.set_study_system_attr(study._study_id, SETTINGS_KEY, settings)
+            return
+        for name, value in settings.items():
+            if begun.get(name) != value:
+                raise ValueError(f"this study was begun with {name}={begun.get(name)!r}, not {value!r}: use another study")
+
+    def _find_place(self, study: Study, trial: FrozenTrial) -> None:
+        wait = _Wait(study, trial)
+        while True:
+            with self._lock:
+                self._refresh(study)
+                # Choosing in the order of numbers: nobody else chooses while no trial before this one is without a place.
+                ahead = self._register.unplaced_before(trial.number)
+                free = None if ahead else self._first_free(study, enqueued="fixed_params" in trial.system_attrs)
+                if free is not None:
+                    self._take(study, trial, *free)
+                    break
+                running = [self._register.trials[number] for number in self._register.open if number != trial.number]
+            if self.worker is not None:
+                workers.fail_dead(study, running)
+            wait.pause(ahead, running)
+
+    def _first_free(self, study: Study, enqueued: bool = False) -> tuple[int, int] | None:
+        """
+        The next place to give out, None if there is none now.
+
+        A loss that the user enqueued takes a random place if there is one: no offspring is lost.
+        """
+        evolution = self._get_evolution(study)
+        stage = evolution.complete_stages(self._register, lambda stage: len(self.operations(stage))) + 1
+        if self.n_stages is not None and stage > self.n_stages:
+            raise SearchComplete(f"all {self.n_stages} stages of the search are complete")
+        free = self._free(stage)
+        if not free and (self.n_stages is None or stage < self.n_stages):
+            stage += 1
+            free = [place for place in self._free(stage) if self.operations(stage)[place] == "random"]
+        if enqueued:
+            free.sort(key=lambda place: self.operations(stage)[place] != "random")
+        return (stage, free[0]) if free else None
+
+    def _free(self, stage: int) -> list[int]:
+        return [place for place in range(len(self.operations(stage))) if self._register.holder(stage, place) is None]
+
+    def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int) -> None:
+        evolution = self._get_evolution(study)
+        attempt = self._register.attempt(stage, place)
+        operation, parents, loss = "enqueued", [], None
+        if "fixed_params" not in trial.system_attrs:
+            candidate = evolution.candidate(stage, place, attempt)
+            operation, parents, loss = candidate.operation, list(candidate.parents), str(candidate.loss)
+        storage, trial_id = study._storage, trial._trial_id
+        claim = {"stage": stage, "place": place, "attempt": attempt, "seed": evolution.seed, "loss": loss}
+        storage.set_trial_system_attr(trial_id, PLACE_KEY, claim)
+        # For people: what a lineage in the dashboard is made of.
+        shown = {"stage": stage, "place": place, "operation": operation, "parents": parents}
+        for key, value in shown.items():
+            storage.set_trial_user_attr(trial_id, key, value)
+
+    def _candidate_loss(self, study: Study, trial: FrozenTrial) -> AuxLoss:
+        place = study._storage.get_trial(trial._trial_id).system_attrs[PLACE_KEY]
+        if place["loss"] is None:
+            # Enqueued: what the user left open is drawn at random.
+            rng = np.random.default_rng([place["seed"], place["stage"], place["place"], place["attempt"]])
+            return space.random_loss(rng, self.max_horizon, self.operators)
+        return AuxLoss.parse(place["loss"])
+
+    # Evolution.
+
+    def _get_evolution(self, study: Study) -> "_Evolution":
+        if self._evolution is None:
+            self._evolution = _Evolution(self, self._study_seed(), lambda trials: self._best(study, trials), self._sign(study))
+        return self._evolution
+
+    def _study_seed(self) -> int:
+        """The seed of the first trial that got a place, so that all workers use one."""
+        first = min((number for numbers in self._register.holders.values() for number in numbers), default=None)
+        if first is None:
+            return int(np.random.SeedSequence().generate_state(1)[0]) if self.seed is None else self.seed
+        seed = self._register.trials[first].system_attrs[PLACE_KEY]["seed"]
+        if self.seed not in (None, seed):
+            logger.warning("The study goes on with its own seed %d, not with %d", seed, self.seed)
+        return seed
+
+    @staticmethod
+    def _sign(study: Study) -> float:
+        return 1.0 if study.direction == StudyDirection.MAXIMIZE else -1.0
+
+    def _population(self, stage: int) -> list[FrozenTrial]:
+        holders = (self._register.holder(stage, place) for place in range(len(self.operations(stage))))
+        return [holder for holder in holders if holder is not None and holder.state in FILLED]
+
+    def _best(self, study: Study, population: list[FrozenTrial]) -> list[FrozenTrial]:
+        """The best share of a stage; equal scores in the order of places, pruned trials behind all others."""
+        sign = self._sign(study)
+
+        def rank(trial: FrozenTrial) -> tuple[bool, float]:
+            if trial.state == TrialState.PRUNED or trial.value is None:
+                return True, 0.0
+            return False, -sign * trial.value
+
+        return sorted(population, key=rank)[: max(1, round(self.parents * len(population)))]
+
+
+class _Wait:
+    """Waiting for a place: cheap, visible in the log and as a user attribute, and not for the dead."""
+
+    def __init__(self, study: Study, trial: FrozenTrial):
+        self.study = study
+        self.trial = trial
+        self.delay = 0.001
+        self.shown = 0.0
+        self.signs: dict[int, tuple[Any, float]] = {}
+
+    def pause(self, ahead: list[FrozenTrial], running: list[FrozenTrial]) -> None:
+        """
+        :param ahead: Trials that have to choose a place before
+        :param running: Trials whose places may become free, or whose stage may end
+        """
+        now = time.monotonic()
+        for other in ahead:
+            sign = other.user_attrs.get(WAITING_KEY)
+            if self.signs.get(other.number, (None, 0.0))[0] != sign or other.number not in self.signs:
+                self.signs[other.number] = (sign, now)
+            elif now - self.signs[other.number][1] > ORPHAN_SECONDS:
+                logger.warning("Trial %d never got a place, its worker seems to have died", other.number)
+                workers.fail(self.study, other, "its worker died before it got a place")
+        if now - self.shown > ORPHAN_SECONDS / 6 and self.delay > 0.1:
+            self.shown = now
+            logger.info("Trial %d waits for a place: %d trials run", self.trial.number, len(running))
+            # Changes each time: a sign of life for the trials behind this one.
+            storage = self.study._storage
+            storage.set_trial_user_attr(
+                self.trial._trial_id, WAITING_KEY, f"for a place, {len(running)} trials run ({now:.0f})"
+            )
+        time.sleep(self.delay)
+        self.delay = min(1.0, 1.5 * self.delay)
+
+
+class _Evolution:
+    """
+    The candidates of all places, as a function of seed, settings and finished stages.
+
+    Stages are planned place by place in one order, because a candidate must not repeat those before it.
+
+    :param sampler: Its settings
+    :param seed: Seed of the study
+    :param best: From the trials of a stage to the parents of the next, the best first
+    :param sign: -1 where scores are minimized
+    """
+
+    def __init__(
+        self,
+        sampler: AuxLossSampler,
+        seed: int,
+        best: Callable[[list[FrozenTrial]], list[FrozenTrial]],
+        sign: float,
+    ):
+        self.sampler = sampler
+        self.seed = seed
+        self.best = best
+        self.sign = sign
+        self.plans: defaultdict[int, list[Candidate]] = defaultdict(list)
+        self.seen: set[AuxLoss] = set()  # canonical forms
+        self.model = TokenModel(sampler.max_horizon)
+        self._populations: list[list[tuple[FrozenTrial, AuxLoss]]] = []  # of complete stages
+
+    def complete_stages(self, register: _Register, n_places: Callable[[int], int]) -> int:
+        """How many stages are complete; takes note of the trials of those that have become so."""
+        while True:
+            stage = len(self._populations) + 1
+            holders = [register.holder(stage, place) for place in range(n_places(stage))]
+            if any(holder is None or holder.state not in FILLED for holder in holders):
+                return stage - 1
+            self._plan(stage, len(holders))  # while the stage before is still the last one known
+            population = []
+            for holder in holders:
+                assert holder is not None
+                try:
+                    population.append((holder, space.params_to_loss(holder.params)))
+                except (KeyError, ValueError):
+                    continue  # what somebody enqueued was no loss, and was pruned
+            self._plan(stage + 1, n_random(self.sampler.operations(stage + 1)))
+            self.seen |= {loss.canonical() for _, loss in population}
+            if self.sampler.screening > 1:
+                scored = [(loss, self.sign * trial.value) for trial, loss in population if trial.value is not None]
+                self.model.add([loss for loss, _ in scored], [score for _, score in scored])
+            self._populations.append(population)
+
+    def candidate(self, stage: int, place: int, attempt: int) -> Candidate:
+        """
+        The candidate of a place.
+
+        :param stage: Number of the stage, from 1
+        :param place: Number of the place, from 0
+        :param attempt: How many candidates of this place failed
+        """
+        if stage > 1:
+            self._plan(stage - 1, len(self.sampler.operations(stage - 1)))  # perhaps other workers took its places
+        self._plan(stage, place + 1)
+        candidate = self.plans[stage][place]
+        if attempt:
+            # Not to repeat what is planned; the random part of the next stage may have been given out already.
+            self._plan(stage, len(self.sampler.operations(stage)))
+            self._plan(stage + 1, n_random(self.sampler.operations(stage + 1)))
+            seen = set(self.seen)
+            for number in range(1, attempt + 1):
+                candidate = self._draw(stage, place, number, seen)
+                seen.add(candidate.loss.canonical())
+        return candidate
+
+    def _plan(self, stage: int, n_places: int) -> None:
+        """Plan the first places of a stage, as many as asked for."""
+        plan = self.plans[stage]
+        while len(plan) < n_places:
+            candidate = self._draw(stage, len(plan), 0, self.seen)
+            self.seen.add(candidate.loss.canonical())
+            plan.append(candidate)
+
+    def _draw(self, stage: int, place: int, attempt: int, seen: set[AuxLoss]) -> Candidate:
+        rng = np.random.default_rng([self.seed, stage, place, attempt])
+        operation = self.sampler.operations(stage)[place]
+        if self.sampler.screening == 1 or not self.model.n_trials:
+            return self._draw_new(rng, operation, stage, place, seen)
+        offspring: list[Candidate] = []
+        drawn = set(seen)
+        for _ in range(self.sampler.screening):
+            offspring.append(self._draw_new(rng, operation, stage, place, drawn))
+            drawn.add(offspring[-1].loss.canonical())
+        return offspring[self.model.best([candidate.loss for candidate in offspring], self.model.draw(rng))]
+
+    def _draw_new(self, rng: np.random.Generator, operation: str, stage: int, place: int, seen: set[AuxLoss]) -> Candidate:
+        """One offspring, drawn again while it is invalid or was there before."""
+        candidate = None
+        for _ in range(MAX_DRAWS):
+            try:
+                candidate = self._offspring(rng, operation, stage, place)
+            except mutations.RejectedLoss:
+                continue
+            if self.sampler.allow_duplicates or candidate.loss.canonical() not in seen:
+                return candidate
+        if operation in ("crossover", "horizon_change"):
+            # No pair of one horizon, two parents that are almost equal, a space of one horizon.
+            return self._draw_new(rng, "replacement", stage, place, seen)
+        if candidate is None:
+            raise RuntimeError(f"no valid loss in {MAX_DRAWS} draws by {operation}")
+        logger.info("No new loss in %d draws by %s: place %d of stage %d repeats one", MAX_DRAWS, operation, place, stage)
+        return candidate
+
+    def _offspring(self, rng: np.random.Generator, operation: str, stage: int, place: int) -> Candidate:
+        sampler = self.sampler
+        if operation == "random":
+            return Candidate(space.random_loss(rng, sampler.max_horizon, sampler.operators), operation)
+        if operation == "prior":
+            prior = space.PRIORS[place % len(space.PRIORS)]
+            return Candidate(prior(rng, sampler.max_horizon, sampler.operators), operation)
+        parents = self._parents(stage)
+        number, loss = parents[rng.integers(len(parents))]
+        if operation == "replacement":
+            return Candidate(mutations.replacement(loss, rng, sampler.operators), operation, (number,))
+        if operation == "horizon_change":
+            return Candidate(mutations.horizon_change(loss, rng, sampler.max_horizon), operation, (number,))
+        partners = _partners(number, loss, parents) or _partners(number, loss, self._losses(stage - 1))
+        if not partners:
+            raise mutations.RejectedLoss(f"no other loss of horizon {loss.horizon} in stage {stage - 1}")
+        other_number, other = partners[rng.integers(len(partners))]
+        return Candidate(mutations.crossover(loss, other, rng), operation, (number, other_number))
+
+    def _losses(self, stage: int) -> list[tuple[int, AuxLoss]]:
+        return [(trial.number, loss) for trial, loss in self._populations[stage - 1]]
+
+    def _parents(self, stage: int) -> list[tuple[int, AuxLoss]]:
+        losses = dict(self._losses(stage - 1))
+        return [
+            (trial.number, losses[trial.number]) for trial in self.best([trial for trial, _ in self._populations[stage - 2]])
+        ]
+
+
+def _partners(number: int, loss: AuxLoss, losses: Iterable[tuple[int, AuxLoss]]) -> list[tuple[int, AuxLoss]]:
+    return [(other, partner) for other, partner in losses if other != number and partner.horizon == loss.horizon]
+
+
+def n_random(operations: Sequence[str]) -> int:
+    """How many places of a later stage are random; they come first."""
+    return sum(operation == "random" for operation in operations)
+
+
+def _apportion(shares: dict[str, float], total: int) -> dict[str, int]:
+    """Whole numbers that sum to ``total``, as near to the shares as can be (largest remainders)."""
+    exact = {name: round(share * total, 9) for name, share in shares.items()}
+    counts = {name: int(value) for name, value in exact.items()}
+    by_remainder = sorted(exact, key=lambda name: counts[name] - exact[name])
+    for name in by_remainder[: total - sum(counts.values())]:
+        counts[name] += 1
+    return counts

@@ -1,0 +1,191 @@
+"""The search space: AuxLoss to and from Optuna parameters, and losses drawn at random and from the paper's priors."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
+
+from sb3_aarl.aux_loss import OPERATORS, AuxLoss, Token
+
+MAX_HORIZON = 10  # paper, section 2.1
+SIDES = ("source", "target")
+Bits = tuple[bool, ...]
+
+
+def is_valid(source: Sequence[bool] | np.ndarray, target: Sequence[bool] | np.ndarray) -> bool:
+    """
+    The paper's loss rejection (A.3): at least one state in the source, and a target that is not empty.
+
+    :param source: 3k + 1 booleans
+    :param target: 3k + 1 booleans
+    """
+    return any(source[::3]) and any(target)
+
+
+def check_operators(operators: Sequence[str] | None) -> None:
+    """
+    :param operators: Names of operators, None where the operator is not searched
+    :raises ValueError: naming what is unknown
+    """
+    unknown = [name for name in operators or () if name not in OPERATORS]
+    if unknown or (operators is not None and (isinstance(operators, str) or not len(operators))):
+        culprit = repr(unknown[0]) if unknown else repr(operators)
+        raise ValueError(f"operators must be a list of {', '.join(OPERATORS)}, or None; {culprit} is not")
+
+
+def distributions(
+    horizon: int, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None
+) -> dict[str, BaseDistribution]:
+    """
+    Optuna's parameters of a loss: ``horizon``, one boolean a token (``source/s_t+1``), ``operator`` and ``negatives``.
+
+    :param horizon: Horizon of the loss, which decides what tokens there are
+    :param max_horizon: Longest horizon of the space
+    :param operators: Operators that are searched too, None for mean squared error without negatives (paper, 2.2)
+    """
+    space: dict[str, BaseDistribution] = {"horizon": IntDistribution(1, max_horizon)}
+    for side in SIDES:
+        for index in range(3 * horizon + 1):
+            space[f"{side}/{Token.of(index)}"] = CategoricalDistribution([False, True])
+    if operators is not None:
+        space["operator"] = CategoricalDistribution(list(operators))
+        space["negatives"] = CategoricalDistribution([False, True])
+    return space
+
+
+def loss_to_params(loss: AuxLoss, operators: Sequence[str] | None = None) -> dict[str, Any]:
+    """
+    The parameters of a loss, for ``study.enqueue_trial`` and the sampler.
+
+    :param loss: The loss
+    :param operators: As in :func:`distributions`
+    """
+    params: dict[str, Any] = {"horizon": loss.horizon}
+    for side in SIDES:
+        params |= {f"{side}/{Token.of(index)}": bit for index, bit in enumerate(getattr(loss, side))}
+    return params if operators is None else {**params, "operator": loss.operator, "negatives": loss.negatives}
+
+
+def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
+    """
+    The loss of a trial's parameters.
+
+    :param params: As :func:`loss_to_params` gives them; others are passed over
+    :raises KeyError: when parameters are missing
+    :raises ValueError: when the loss is not valid
+    """
+    horizon = params["horizon"]
+    masks = [tuple(params[f"{side}/{Token.of(index)}"] for index in range(3 * horizon + 1)) for side in SIDES]
+    return AuxLoss(horizon, masks[0], masks[1], params.get("operator", "mse"), params.get("negatives", False))
+
+
+def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
+    """
+    Ask a trial for a loss, with any sampler of Optuna.
+
+    :param trial: The trial
+    :param max_horizon: Longest horizon of the space
+    :param operators: Operators to search too, with and without negatives; None for mean squared error without
+    :raises optuna.TrialPruned: when the sampler proposes what is not valid; nothing was trained then
+    """
+    check_operators(operators)
+    horizon = trial.suggest_int("horizon", 1, max_horizon)
+    params: dict[str, Any] = {"horizon": horizon}
+    for name, distribution in distributions(horizon, max_horizon, operators).items():
+        if isinstance(distribution, CategoricalDistribution):
+            params[name] = trial.suggest_categorical(name, distribution.choices)
+    try:
+        return params_to_loss(params)
+    except ValueError as error:
+        raise optuna.TrialPruned(str(error)) from None
+
+
+def random_operator(rng: np.random.Generator, operators: Sequence[str] | None) -> tuple[str, bool]:
+    """
+    :param rng: Source of randomness
+    :param operators: As in :func:`distributions`
+    :return: Operator and whether it has negatives, uniform over all
+    """
+    if operators is None:
+        return "mse", False
+    return operators[int(rng.integers(len(operators)))], bool(rng.integers(2))
+
+
+def _draw(
+    rng: np.random.Generator,
+    max_horizon: int,
+    operators: Sequence[str] | None,
+    draw_masks: Callable[[int], tuple[np.ndarray, np.ndarray]],
+) -> AuxLoss:
+    # The horizon is drawn once: redrawing it with rejected masks would favour long ones.
+    horizon = int(rng.integers(1, max_horizon + 1))
+    source, target = draw_masks(horizon)
+    while not is_valid(source, target):
+        source, target = draw_masks(horizon)
+    return AuxLoss(horizon, tuple(source.tolist()), tuple(target.tolist()), *random_operator(rng, operators))
+
+
+def random_loss(rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
+    """
+    A loss whose horizon is uniform and whose bits are Bernoulli(0.5), invalid ones redrawn (paper, A.3).
+
+    :param rng: Source of randomness
+    :param max_horizon: Longest horizon of the space
+    :param operators: Operators to draw from, None for mean squared error without negatives
+    """
+
+    def draw_masks(horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        source, target = rng.random((2, 3 * horizon + 1)) < 0.5
+        return source, target
+
+    return _draw(rng, max_horizon, operators, draw_masks)
+
+
+def forward_dynamics_prior(
+    rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None
+) -> AuxLoss:
+    """
+    A loss that resembles forward dynamics (paper, A.3): states of the source Bernoulli(0.2), its actions
+    Bernoulli(0.8), states of the target those that are not in the source, all other bits Bernoulli(0.5).
+
+    The paper prints "target" for the first of these; only with the source does its third rule make sense.
+
+    :param rng: Source of randomness
+    :param max_horizon: Longest horizon of the space
+    :param operators: As in :func:`random_loss`
+    """
+
+    def draw_masks(horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        chances = np.full((2, 3 * horizon + 1), 0.5)
+        chances[0, ::3], chances[0, 1::3] = 0.2, 0.8
+        source, target = rng.random(chances.shape) < chances
+        target[::3] = ~source[::3]
+        return source, target
+
+    return _draw(rng, max_horizon, operators, draw_masks)
+
+
+def reward_prediction_prior(
+    rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None
+) -> AuxLoss:
+    """
+    A loss that resembles reward prediction (paper, A.3): rewards of the target Bernoulli(0.8), no states and actions
+    in the target, the source Bernoulli(0.5).
+
+    :param rng: Source of randomness
+    :param max_horizon: Longest horizon of the space
+    :param operators: As in :func:`random_loss`
+    """
+
+    def draw_masks(horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        chances = np.zeros((2, 3 * horizon + 1))
+        chances[0], chances[1, 2::3] = 0.5, 0.8
+        source, target = rng.random(chances.shape) < chances
+        return source, target
+
+    return _draw(rng, max_horizon, operators, draw_masks)
+
+
+PRIORS = (forward_dynamics_prior, reward_prediction_prior)

@@ -1,0 +1,83 @@
+"""Who works on a trial, and what becomes of the trials of a worker that has died."""
+
+import contextlib
+import os
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+
+import psutil
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.study import Study
+from optuna.trial import FrozenTrial, TrialState
+
+# User attribute of a trial: the identity of the process that asked for it.
+WORKER_KEY = "worker"
+
+
+def identity(pid: int | None = None) -> str:
+    """
+    What names a process for good: host, boot, process namespace, number and start time.
+
+    :param pid: Process number on this machine, None for this process
+    :raises psutil.NoSuchProcess: when there is none
+    """
+    process = psutil.Process(pid)
+    return f"{_machine()} {process.pid} {process.create_time():.2f}"
+
+
+def _machine() -> str:
+    """Host, boot and process namespace: process numbers of two containers, or from before a reboot, say nothing."""
+    parts = [platform.node()]
+    for read in (
+        lambda: Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+        lambda: os.readlink("/proc/self/ns/pid"),
+    ):
+        with contextlib.suppress(OSError):
+            parts.append(read())
+    return "/".join(parts)
+
+
+def is_dead(worker: str) -> bool:
+    """
+    Whether a worker is known to have died. False for workers of other machines, of which nothing is known here.
+
+    :param worker: What :func:`identity` gave
+    """
+    machine, pid, started = worker.rsplit(" ", 2)
+    if machine != _machine():
+        return False
+    try:
+        process = psutil.Process(int(pid))
+        return f"{process.create_time():.2f}" != started or process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def fail(study: Study, trial: FrozenTrial, reason: str) -> bool:
+    """
+    Mark a running trial as failed from outside.
+
+    :param study: The study
+    :param trial: The trial
+    :param reason: Kept as the user attribute ``reason``
+    :return: False if it had finished, or another worker was faster
+    """
+    storage = study._storage
+    try:
+        storage.set_trial_user_attr(trial._trial_id, "reason", reason)
+        return storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+    except UpdateFinishedTrialError:
+        return False
+
+
+def fail_dead(study: Study, trials: Iterable[FrozenTrial]) -> int:
+    """
+    Fail the running trials whose worker has died on this machine, so that their places are given out again.
+
+    :param study: The study
+    :param trials: Trials to look at
+    :return: How many were failed
+    """
+    workers = ((trial, trial.user_attrs.get(WORKER_KEY)) for trial in trials if trial.state == TrialState.RUNNING)
+    return sum(fail(study, trial, "its worker died") for trial, worker in workers if worker is not None and is_dead(worker))
