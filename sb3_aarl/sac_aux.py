@@ -243,6 +243,10 @@ class SACAux(SAC):
             )
 
     def _make_replay_buffer(self) -> WindowReplayBuffer:
+        # SB3's own check, which it makes before its buffer is there.
+        assert self.n_steps == 1 or not isinstance(self.observation_space, spaces.Dict), (
+            f"n_steps={self.n_steps}: n-step returns are not supported for Dict observation spaces"
+        )
         if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
             self.replay_buffer_kwargs["frame_stack"] = detect_frame_stack(self.env)
         n_steps = {"n_steps": self.n_steps, "gamma": self.gamma}

@@ -297,6 +297,18 @@ def test_vec_normalize_reaches_the_auxiliary_loss() -> None:
     np.testing.assert_allclose(seen[0].rewards, rewards, rtol=1e-4)
 
 
+def test_buffer_is_extended_with_rows_of_another() -> None:
+    model = make_model(DummyVecEnv([RandomEnv] * 2)).learn(30)
+    old, buffer = deepcopy(model.replay_buffer), model.replay_buffer
+    buffer.reset()
+    timeouts = old.timeouts[:15]
+    infos = [[{"TimeLimit.truncated": over} for over in row[:, None]] for row in timeouts]
+    buffer.extend(old.observations[:15], old.next_observations[:15], old.actions[:15], old.rewards[:15], old.dones[:15], infos)
+    assert timeouts.sum() == 2 and buffer.size() == 15
+    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+        np.testing.assert_array_equal(getattr(buffer, name)[:15], getattr(old, name)[:15])
+
+
 @pytest.mark.parametrize("n_stack", [2, 3])
 def test_frame_stack_before_and_after_transposition(n_stack: int) -> None:
     def images() -> gym.Env:
@@ -330,6 +342,8 @@ def test_n_step_returns() -> None:
     np.testing.assert_allclose(batch.rewards, (1 - batch.discounts) / (1 - 0.9), rtol=1e-5)
     lengths = np.round(np.log(batch.discounts.numpy()) / np.log(0.9)).ravel()
     assert set(lengths) == {1, 2, 3}
+    with pytest.raises(AssertionError, match="Dict observation spaces"):
+        make_model(RandomEnv(MIXED), "MultiInputPolicy", n_steps=3)
 
 
 def test_optimize_memory_usage_changes_nothing() -> None:
