@@ -1,0 +1,55 @@
+# make demo    a small search on DeepMind Control's Cheetah-Run, and a training with what it found
+# make test    all tests, what they need included
+# make lint    ruff and mypy
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+# Headless rendering for the tests from pixels; the browser for the test of optuna-dashboard.
+RENDERING := libegl1 libosmesa6 libgl1-mesa-dri
+BROWSER := chromium chromium-driver
+
+.PHONY: demo test lint system clean
+
+demo: $(VENV)/.installed
+	$(BIN)/python -m search.demo --out runs/demo
+
+test: $(VENV)/.installed-dev system
+	$(BIN)/python -m pytest -n 2
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# labmaze, which dm-control asks for, has no wheel for Python 3.13; the suite does not need it.
+define install
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	if $(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then \
+		$(BIN)/python -m pip install --quiet --no-deps -c constraints.txt dm-control; \
+	fi
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[$(1)]'
+	touch $@
+endef
+
+$(VENV)/.installed: setup.cfg constraints.txt
+	$(call install,search)
+
+$(VENV)/.installed-dev: setup.cfg constraints.txt
+	$(call install,dev)
+	touch $(VENV)/.installed
+
+# Installs what is missing if that is possible without asking; else one line says what to do.
+system:
+	@missing=; for package in $(RENDERING) $(BROWSER); do \
+		dpkg -s $$package >/dev/null 2>&1 || missing="$$missing $$package"; \
+	done; \
+	if [ -n "$$missing" ]; then \
+		if [ "$$(id -u)" = 0 ]; then sudo=; else sudo='sudo -n'; fi; \
+		if ! { $$sudo apt-get update -qq && $$sudo apt-get install -y -qq --no-install-recommends $$missing; } >/dev/null 2>&1; \
+		then echo "Some tests need system packages that could not be installed; as root: apt-get install$$missing"; fi; \
+	fi
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
