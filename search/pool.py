@@ -1,0 +1,127 @@
+"""Worker processes of one machine: started, replaced when they die, stopped together."""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+# Deaths of workers without a trial finished in between, after which the pool gives up.
+MAX_DEATHS = 5
+
+
+class WorkerError(RuntimeError):
+    """A worker stopped with an error, or workers keep dying; the message says why."""
+
+
+def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, threads: int) -> None:
+    """What a worker process runs."""
+    import torch as th
+
+    th.set_num_threads(threads)
+    threading.Thread(target=_stop_with_parent, args=(os.getppid(),), daemon=True).start()
+    try:
+        target(*arguments)
+    except KeyboardInterrupt:
+        os._exit(128 + signal.SIGINT)
+    except Exception as error:
+        errors.put(f"{error}" if isinstance(error, ValueError) else traceback.format_exc())
+        os._exit(1)
+
+
+def _stop_with_parent(parent: int) -> None:
+    """Workers must not outlive the program: the same command, started again, would have twice as many."""
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(1)
+
+
+class WorkerPool:
+    """
+    Some processes that run one function until it returns.
+
+    A worker that is killed is started again; one that raises stops the pool. Leaving the ``with`` block interrupts
+    those that still run, as Ctrl-C does, so that they can put away what they have.
+
+    :param target: Function that each worker runs; it returns when nothing is left to do
+    :param arguments: Its arguments, which must be picklable
+    :param n_workers: Number of processes
+    """
+
+    def __init__(self, target: Callable[..., None], arguments: tuple[Any, ...], n_workers: int):
+        if n_workers < 1:
+            raise ValueError(f"workers must be at least 1, not {n_workers}")
+        # Not fork: PyTorch's threads and open storages do not survive it.
+        self._context = multiprocessing.get_context("spawn")
+        self._errors = self._context.SimpleQueue()
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._start = (target, arguments, self._errors, max(1, cores // n_workers))
+        self.processes: list[BaseProcess] = []
+        self.deaths = 0
+        self._n_workers = n_workers
+
+    def __enter__(self) -> "WorkerPool":
+        for _ in range(self._n_workers):
+            self._add()
+        return self
+
+    def _add(self) -> None:
+        # Two threads of BLAS or OpenMP for each of two workers on two cores are four: slower than one each.
+        with _environment(OMP_NUM_THREADS=str(self._start[-1]), MKL_NUM_THREADS=str(self._start[-1])):
+            process = self._context.Process(target=_work, args=self._start)
+            process.start()
+        self.processes.append(process)
+
+    def check(self, progressed: bool) -> bool:
+        """
+        Start workers again that were killed.
+
+        :param progressed: Whether a trial has finished since the last call
+        :return: Whether any worker still runs
+        :raises WorkerError: when a worker stopped with an error, or they keep dying
+        """
+        self.deaths = 0 if progressed else self.deaths
+        for process in list(self.processes):
+            if process.exitcode is None:
+                continue
+            self.processes.remove(process)
+            if not self._errors.empty():
+                raise WorkerError(self._errors.get())
+            if process.exitcode == 128 + signal.SIGINT:
+                raise KeyboardInterrupt
+            if process.exitcode != 0:
+                self.deaths += 1
+                if self.deaths > MAX_DEATHS:
+                    raise WorkerError(f"{self.deaths} workers died one after the other (exit code {process.exitcode})")
+                self._add()
+        return bool(self.processes)
+
+    def __exit__(self, *exception: Any) -> None:
+        for process in self.processes:
+            if process.pid is not None and process.exitcode is None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(process.pid, signal.SIGINT)
+        for process in self.processes:
+            process.join(timeout=60)
+            if process.exitcode is None:
+                process.kill()
+
+
+@contextlib.contextmanager
+def _environment(**variables: str) -> Any:
+    """Environment variables for the processes that are started inside."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

@@ -1,0 +1,67 @@
+"""Storages of studies: an embedded journal by default, SQLite and databases by URL."""
+
+import re
+from pathlib import Path
+
+import optuna
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages.journal import JournalFileBackend
+
+JOURNAL = "journal.log"
+# Seconds: SQLite's lock is held for milliseconds, but many workers may queue for it.
+SQLITE_TIMEOUT = 120
+# Seconds between the signs of life that a worker leaves in a database (paper-sized trials run for hours).
+HEARTBEAT_INTERVAL = 60
+
+
+def open_storage(where: str | Path) -> BaseStorage:
+    """
+    Open a storage, and make it if it is not there.
+
+    :param where: A folder, for the embedded journal in it, which is safe for several processes of one machine; a file
+        that ends in ``.log``, for a journal; or the URL of a database, such as ``sqlite:///study.db`` or
+        ``postgresql://user:password@host/database``
+    :raises ValueError: when it cannot be opened; passwords are left out of the message
+    """
+    where = str(where)
+    try:
+        if "://" in where:
+            connect_args = {"timeout": SQLITE_TIMEOUT} if where.startswith("sqlite") else {}
+            return RDBStorage(
+                where,
+                engine_kwargs={"connect_args": connect_args},
+                heartbeat_interval=HEARTBEAT_INTERVAL,
+                failed_trial_callback=None,
+            )
+        path = Path(where)
+        path = path if path.suffix == ".log" else path / JOURNAL
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return JournalStorage(JournalFileBackend(str(path)))
+    except Exception as error:  # whatever a driver raises
+        raise ValueError(f"cannot open the storage {without_password(where)}: {without_password(str(error))}") from None
+
+
+def without_password(text: str) -> str:
+    """
+    :param text: A URL, or a message with URLs in it
+    :return: The same with the passwords replaced by ``***``
+    """
+    return re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", text)
+
+
+def load_study(storage: BaseStorage, name: str | None = None) -> optuna.Study:
+    """
+    A study of the storage.
+
+    :param storage: The storage
+    :param name: Its name, None for the only one
+    :raises ValueError: naming the studies that there are, when none fits
+    """
+    names = optuna.get_all_study_names(storage)
+    if name is None and len(names) == 1:
+        name = names[0]
+    if name not in names:
+        problem = "which study" if name is None else f"no study {name!r}"
+        raise ValueError(f"{problem}: the storage has {', '.join(names) or 'none'}")
+    assert name is not None
+    return optuna.load_study(study_name=name, storage=storage)
