@@ -76,9 +76,11 @@ class AuxLoss:
             mask = tuple(getattr(self, name))
             if len(mask) != 3 * self.horizon + 1:
                 raise ValueError(f"{name} has {len(mask)} bits, but horizon {self.horizon} has {3 * self.horizon + 1} tokens")
-            if any(bit not in (False, True) for bit in mask):
-                raise ValueError(f"{name} must be booleans, not {mask}")
-            object.__setattr__(self, name, tuple(bool(bit) for bit in mask))
+            if set(map(type, mask)) != {bool}:  # the search makes very many: look at each bit only where it is needed
+                if any(bit not in (False, True) for bit in mask):
+                    raise ValueError(f"{name} must be booleans, not {mask}")
+                mask = tuple(bool(bit) for bit in mask)
+            object.__setattr__(self, name, mask)
         if self.operator not in OPERATORS:
             raise ValueError(f"unknown operator {self.operator!r}, expected one of {', '.join(OPERATORS)}")
         if self.negatives not in (False, True):  # bool() would take the text "false" for true
@@ -175,6 +177,8 @@ class AuxLoss:
         chosen = [i for i, bits in enumerate(zip(self.source, self.target, strict=True)) if any(bits)]
         first = chosen[0] // 3 * 3
         horizon = max(1, -(-(chosen[-1] - first) // 3))  # state i closes step i, action and reward i lie in step i + 1
+        if first == 0 and horizon == self.horizon:
+            return self
         # A state at the very end, alone, has no step behind it.
         source, target = ((mask[first:] + (False,) * 3)[: 3 * horizon + 1] for mask in (self.source, self.target))
         return AuxLoss(horizon, source, target, self.operator, self.negatives)

@@ -1,11 +1,14 @@
 """AuxLossSampler: the paper's evolution of auxiliary losses (section 2.2, A.3) as a sampler of Optuna."""
 
+import bisect
 import contextlib
 import logging
 import threading
 import time
+import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,8 +26,9 @@ from search.token_model import TokenModel
 
 logger = logging.getLogger(__name__)
 
-# System attributes of a trial. The place is written once, in one piece, and is what gives the trial its candidate.
+# System attributes of a trial. The place is written in one piece, and is what gives the trial its candidate.
 PLACE_KEY = "AuxLossSampler:place"
+# The candidate itself was at fault: it failed in a live worker, or was no valid loss (enqueued by the user).
 REJECTED_KEY = "AuxLossSampler:rejected"
 # A trial without a place shows with this user attribute that its worker still waits for one.
 WAITING_KEY = "waiting"
@@ -37,7 +41,7 @@ MAX_DEATHS = 3
 # Seconds without a sign of life after which a trial that never got a place is given up.
 ORPHAN_SECONDS = 60.0
 
-OCCUPYING = (TrialState.RUNNING, TrialState.WAITING, TrialState.COMPLETE, TrialState.PRUNED)
+OPEN = (TrialState.RUNNING, TrialState.WAITING)
 FILLED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
@@ -81,37 +85,44 @@ class _Register:
     def __init__(self) -> None:
         self.trials: Sequence[FrozenTrial] = ()
         self.open: set[int] = set()  # numbers of trials that are not finished
-        self.holders: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
-        self._placed: set[int] = set()
+        self.places: dict[int, tuple[int, int]] = {}  # stage and place of each trial that has one
+        self.holders: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # and the other way, in order
 
     def refresh(self, trials: Sequence[FrozenTrial]) -> None:
-        changed = [*sorted(self.open), *range(len(self.trials), len(trials))]
+        changed = [*self.open, *range(len(self.trials), len(trials))]
         self.trials = trials
         for number in changed:
-            trial = trials[number]
-            place = trial.system_attrs.get(PLACE_KEY)
-            if place is not None and number not in self._placed:
-                self._placed.add(number)
-                self.holders[place["stage"], place["place"]].append(number)
-            (self.open.discard if trial.state.is_finished() else self.open.add)(number)
+            claim = trials[number].system_attrs.get(PLACE_KEY)
+            place = None if claim is None else (claim["stage"], claim["place"])
+            if place != self.places.get(number):
+                if number in self.places:
+                    self.holders[self.places.pop(number)].remove(number)
+                if place is not None:
+                    self.places[number] = place
+                    bisect.insort(self.holders[place], number)
+            (self.open.discard if trials[number].state.is_finished() else self.open.add)(number)
 
-    def holder(self, stage: int, place: int) -> FrozenTrial | None:
-        """The trial that has the place, running or finished; None where all failed or there was none."""
-        for number in reversed(self.holders.get((stage, place), ())):
-            if self.trials[number].state in OCCUPYING:
-                return self.trials[number]
-        return None
+    def held_by(self, stage: int, place: int) -> list[FrozenTrial]:
+        """The trials that have the place, waiting, running or finished: one at most once all have chosen."""
+        holders = [self.trials[number] for number in self.holders.get((stage, place), ())]
+        return [trial for trial in holders if trial.state in FILLED + OPEN and not _is_invalid(trial)]
+
+    def is_shared(self, number: int) -> bool:
+        """Whether another trial has the place of this one."""
+        return any(holder.number != number for holder in self.held_by(*self.places[number]))
 
     def attempt(self, stage: int, place: int) -> int:
         """How many candidates of the place were given up because they failed."""
         attempt = deaths = 0
-        for number in sorted(self.holders.get((stage, place), ())):
+        for number in self.holders.get((stage, place), ()):
             trial = self.trials[number]
-            if trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted"):
-                # Without the mark of a live worker it was the worker that died: the same candidate has another try.
-                deaths += 1
-                if REJECTED_KEY in trial.system_attrs or deaths > MAX_DEATHS:
-                    attempt, deaths = attempt + 1, 0
+            if trial.system_attrs[PLACE_KEY]["loss"] is None:
+                continue  # enqueued
+            rejected = REJECTED_KEY in trial.system_attrs and trial.state in (TrialState.FAIL, TrialState.PRUNED)
+            # Without the mark of a live worker it was the worker that died: the same candidate has another try.
+            deaths += trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted")
+            if rejected or deaths > MAX_DEATHS:
+                attempt, deaths = attempt + 1, 0
         return attempt
 
     def unplaced_before(self, number: int) -> list[FrozenTrial]:
@@ -120,7 +131,7 @@ class _Register:
             self.trials[other]
             for other in sorted(self.open)
             if other < number
-            and other not in self._placed
+            and other not in self.places
             and self.trials[other].state == TrialState.RUNNING
             and not self.trials[other].params  # one with parameters comes from another sampler
         ]
@@ -210,7 +221,6 @@ class AuxLossSampler(BaseGASampler):
         self._first_operations = ["random"] * n_random + prior
         counts = _apportion(shares, population_size)
         self._operations = [name for name in shares for _ in range(counts[name])]
-        self._other_params = RandomSampler(seed)
         self._reset()
 
     def _reset(self) -> None:
@@ -248,8 +258,7 @@ class AuxLossSampler(BaseGASampler):
             progress = []
             for stage in range(1, last + 1):
                 places = len(self.operations(stage))
-                holders = [register.holder(stage, place) for place in range(places)]
-                states = [holder.state for holder in holders if holder is not None]
+                states = [holder.state for place in range(places) for holder in register.held_by(stage, place)[:1]]
                 filled = sum(state in FILLED for state in states)
                 tried = [number for place in range(places) for number in register.holders.get((stage, place), ())]
                 failed = sum(register.trials[number].state == TrialState.FAIL for number in tried)
@@ -273,8 +282,6 @@ class AuxLossSampler(BaseGASampler):
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
         """Give the trial a place. Waits for one where there is none, and for trials before it that still choose."""
         self._raise_error_if_multi_objective(study)
-        if PLACE_KEY in trial.system_attrs:
-            return  # a copy of a trial whose worker died, which keeps its place
         try:
             if self.worker is not None:
                 study._storage.set_trial_user_attr(trial._trial_id, workers.WORKER_KEY, self.worker)
@@ -286,22 +293,38 @@ class AuxLossSampler(BaseGASampler):
             raise
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        return space.distributions(self._candidate_loss(study, trial).horizon, self.max_horizon, self.operators)
+        return space.distributions(self.max_horizon, self.max_horizon, self.operators)
 
     def sample_relative(self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]) -> dict[str, Any]:
-        return space.loss_to_params(self._candidate_loss(study, trial), self.operators)
+        trial = study._storage.get_trial(trial._trial_id)
+        claim = trial.system_attrs[PLACE_KEY]
+        if claim["loss"] is not None:
+            return space.loss_to_params(AuxLoss.parse(claim["loss"]), self.operators)
+        # Enqueued: what the user left open is drawn at random, so that a valid loss comes out if there is one.
+        given = {**trial.params, **trial.system_attrs.get("fixed_params", {})}
+        rng = np.random.default_rng([claim["seed"], claim["stage"], claim["place"], claim["attempt"]])
+        for _ in range(MAX_DRAWS):
+            params = {
+                **space.loss_to_params(space.random_loss(rng, self.max_horizon, self.operators), self.operators),
+                **given,
+            }
+            with contextlib.suppress(KeyError, ValueError):
+                return space.loss_to_params(space.params_to_loss(params), self.operators)
+        return {}
 
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        return self._other_params.sample_independent(study, trial, param_name, param_distribution)
-
-    def reseed_rng(self) -> None:
-        self._other_params.reseed_rng()
+        """What the user searches beside the loss is drawn at random, as a function of the place like the loss itself."""
+        claim = study._storage.get_trial(trial._trial_id).system_attrs[PLACE_KEY]
+        key = [claim["seed"], claim["stage"], claim["place"], claim["attempt"], zlib.crc32(param_name.encode())]
+        sampler = RandomSampler(int(np.random.SeedSequence(key).generate_state(1)[0]))
+        return sampler.sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None) -> None:
-        """Mark a candidate that failed in a live worker: its place gets another one."""
-        if state == TrialState.FAIL and not trial.user_attrs.get("interrupted"):
+        """Mark a candidate that failed in a live worker, or was pruned as invalid: its place gets another one."""
+        failed = state == TrialState.FAIL and not trial.user_attrs.get("interrupted")
+        if failed or (state == TrialState.PRUNED and _loss(trial) is None):
             study._storage.set_trial_system_attr(trial._trial_id, REJECTED_KEY, True)
 
     def get_trial_generation(self, study: Study, trial: FrozenTrial) -> int:
@@ -317,7 +340,7 @@ class AuxLossSampler(BaseGASampler):
 
     def select_parent(self, study: Study, generation: int) -> list[FrozenTrial]:
         """The parents of a stage (from 0): the best of the one before, the best first."""
-        return self._best(study, self.get_population(study, generation - 1))
+        return self._best(self.get_population(study, generation - 1), self._sign(study))
 
     # Places.
 
@@ -357,13 +380,25 @@ class AuxLossSampler(BaseGASampler):
         while True:
             with self._lock:
                 self._refresh(study)
+                register = self._register
                 # Choosing in the order of numbers: nobody else chooses while no trial before this one is without a place.
-                ahead = self._register.unplaced_before(trial.number)
-                free = None if ahead else self._first_free(study, enqueued="fixed_params" in trial.system_attrs)
-                if free is not None:
-                    self._take(study, trial, *free)
-                    break
-                running = [self._register.trials[number] for number in self._register.open if number != trial.number]
+                # A copy of a trial whose worker died brings its place.
+                ahead = [] if trial.number in register.places else register.unplaced_before(trial.number)
+                free = None
+                if not ahead and trial.number not in register.places:
+                    is_given = bool(trial.params) or "fixed_params" in trial.system_attrs
+                    free = self._first_free(study, is_given)
+                    if free is not None:
+                        self._take(study, trial, *free, is_given)
+                        self._refresh(study)
+                if trial.number in register.places:
+                    if not register.is_shared(trial.number):
+                        return
+                    # Enqueued trials and copies come out of turn, and may take a place at the same moment as another.
+                    # Whoever finds on looking back that he is not alone gives way: one at least of two does find it.
+                    study._storage.set_trial_system_attr(trial._trial_id, PLACE_KEY, None)
+                    self._evolution = None  # its seed may not be the other's
+                running = [register.trials[number] for number in register.open if number != trial.number]
             if self.worker is not None:
                 workers.fail_dead(study, running)
             wait.pause(ahead, running)
@@ -375,7 +410,7 @@ class AuxLossSampler(BaseGASampler):
         A loss that the user enqueued takes a random place if there is one: no offspring is lost.
         """
         evolution = self._get_evolution(study)
-        stage = evolution.complete_stages(self._register, lambda stage: len(self.operations(stage))) + 1
+        stage = evolution.complete_stages(self._register) + 1
         if self.n_stages is not None and stage > self.n_stages:
             raise SearchComplete(f"all {self.n_stages} stages of the search are complete")
         free = self._free(stage)
@@ -387,13 +422,13 @@ class AuxLossSampler(BaseGASampler):
         return (stage, free[0]) if free else None
 
     def _free(self, stage: int) -> list[int]:
-        return [place for place in range(len(self.operations(stage))) if self._register.holder(stage, place) is None]
+        return [place for place in range(len(self.operations(stage))) if not self._register.held_by(stage, place)]
 
-    def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int) -> None:
+    def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int, is_given: bool) -> None:
         evolution = self._get_evolution(study)
         attempt = self._register.attempt(stage, place)
         operation, parents, loss = "enqueued", [], None
-        if "fixed_params" not in trial.system_attrs:
+        if not is_given:
             candidate = evolution.candidate(stage, place, attempt)
             operation, parents, loss = candidate.operation, list(candidate.parents), str(candidate.loss)
         storage, trial_id = study._storage, trial._trial_id
@@ -404,19 +439,11 @@ class AuxLossSampler(BaseGASampler):
         for key, value in shown.items():
             storage.set_trial_user_attr(trial_id, key, value)
 
-    def _candidate_loss(self, study: Study, trial: FrozenTrial) -> AuxLoss:
-        place = study._storage.get_trial(trial._trial_id).system_attrs[PLACE_KEY]
-        if place["loss"] is None:
-            # Enqueued: what the user left open is drawn at random.
-            rng = np.random.default_rng([place["seed"], place["stage"], place["place"], place["attempt"]])
-            return space.random_loss(rng, self.max_horizon, self.operators)
-        return AuxLoss.parse(place["loss"])
-
     # Evolution.
 
     def _get_evolution(self, study: Study) -> "_Evolution":
         if self._evolution is None:
-            self._evolution = _Evolution(self, self._study_seed(), lambda trials: self._best(study, trials), self._sign(study))
+            self._evolution = _Evolution(self, self._study_seed(), self._sign(study))
         return self._evolution
 
     def _study_seed(self) -> int:
@@ -434,12 +461,11 @@ class AuxLossSampler(BaseGASampler):
         return 1.0 if study.direction == StudyDirection.MAXIMIZE else -1.0
 
     def _population(self, stage: int) -> list[FrozenTrial]:
-        holders = (self._register.holder(stage, place) for place in range(len(self.operations(stage))))
-        return [holder for holder in holders if holder is not None and holder.state in FILLED]
+        holders = (holder for place in range(len(self.operations(stage))) for holder in self._register.held_by(stage, place))
+        return [holder for holder in holders if holder.state in FILLED]
 
-    def _best(self, study: Study, population: list[FrozenTrial]) -> list[FrozenTrial]:
+    def _best(self, population: list[FrozenTrial], sign: float) -> list[FrozenTrial]:
         """The best share of a stage; equal scores in the order of places, pruned trials behind all others."""
-        sign = self._sign(study)
 
         def rank(trial: FrozenTrial) -> tuple[bool, float]:
             if trial.state == TrialState.PRUNED or trial.value is None:
@@ -447,6 +473,19 @@ class AuxLossSampler(BaseGASampler):
             return False, -sign * trial.value
 
         return sorted(population, key=rank)[: max(1, round(self.parents * len(population)))]
+
+
+def _loss(trial: FrozenTrial) -> AuxLoss | None:
+    """The loss of a trial's parameters, None where they are none."""
+    try:
+        return space.params_to_loss(trial.params)
+    except (KeyError, ValueError):
+        return None
+
+
+def _is_invalid(trial: FrozenTrial) -> bool:
+    """Whether a trial was pruned because it was no loss: that costs nothing, and fills no place."""
+    return trial.state == TrialState.PRUNED and REJECTED_KEY in trial.system_attrs
 
 
 class _Wait:
@@ -492,47 +531,40 @@ class _Evolution:
 
     :param sampler: Its settings
     :param seed: Seed of the study
-    :param best: From the trials of a stage to the parents of the next, the best first
     :param sign: -1 where scores are minimized
     """
 
-    def __init__(
-        self,
-        sampler: AuxLossSampler,
-        seed: int,
-        best: Callable[[list[FrozenTrial]], list[FrozenTrial]],
-        sign: float,
-    ):
+    def __init__(self, sampler: AuxLossSampler, seed: int, sign: float):
         self.sampler = sampler
         self.seed = seed
-        self.best = best
         self.sign = sign
         self.plans: defaultdict[int, list[Candidate]] = defaultdict(list)
-        self.seen: set[AuxLoss] = set()  # canonical forms
+        self.seen: dict[AuxLoss, None] = {}  # canonical forms, in the order in which they came
         self.model = TokenModel(sampler.max_horizon)
-        self._populations: list[list[tuple[FrozenTrial, AuxLoss]]] = []  # of complete stages
+        # Of each complete stage: all trials with their losses, and those of them that are parents.
+        self._losses: list[list[tuple[int, AuxLoss]]] = []
+        self._parents: list[list[tuple[int, AuxLoss]]] = []
+        self._n_seen: dict[int, int] = {}  # how many there were when the random places of a stage were planned
 
-    def complete_stages(self, register: _Register, n_places: Callable[[int], int]) -> int:
+    def complete_stages(self, register: _Register) -> int:
         """How many stages are complete; takes note of the trials of those that have become so."""
         while True:
-            stage = len(self._populations) + 1
-            holders = [register.holder(stage, place) for place in range(n_places(stage))]
-            if any(holder is None or holder.state not in FILLED for holder in holders):
+            stage = len(self._losses) + 1
+            holders = [holder for place in range(self._size(stage)) for holder in register.held_by(stage, place)[:1]]
+            if len(holders) < self._size(stage) or any(holder.state not in FILLED for holder in holders):
                 return stage - 1
-            self._plan(stage, len(holders))  # while the stage before is still the last one known
-            population = []
-            for holder in holders:
-                assert holder is not None
-                try:
-                    population.append((holder, space.params_to_loss(holder.params)))
-                except (KeyError, ValueError):
-                    continue  # what somebody enqueued was no loss, and was pruned
-            self._plan(stage + 1, n_random(self.sampler.operations(stage + 1)))
-            self.seen |= {loss.canonical() for _, loss in population}
+            self._plan_random(stage + 1)  # while the stage before is still the last one known
+            losses = {holder.number: loss for holder in holders if (loss := _loss(holder)) is not None}
+            if not losses:
+                raise RuntimeError(f"no trial of stage {stage} has a loss: the objective has to call suggest_aux_loss")
+            population = [holder for holder in holders if holder.number in losses]
+            self.seen |= dict.fromkeys(loss.canonical() for loss in losses.values())
             if self.sampler.screening > 1:
-                scored = [(loss, self.sign * trial.value) for trial, loss in population if trial.value is not None]
+                # A pruned trial counts with the score that it was pruned for.
+                scored = [(losses[trial.number], self.sign * trial.value) for trial in population if trial.value is not None]
                 self.model.add([loss for loss, _ in scored], [score for _, score in scored])
-            self._populations.append(population)
+            self._losses.append(list(losses.items()))
+            self._parents.append([(trial.number, losses[trial.number]) for trial in self.sampler._best(population, self.sign)])
 
     def candidate(self, stage: int, place: int, attempt: int) -> Candidate:
         """
@@ -542,41 +574,59 @@ class _Evolution:
         :param place: Number of the place, from 0
         :param attempt: How many candidates of this place failed
         """
-        if stage > 1:
-            self._plan(stage - 1, len(self.sampler.operations(stage - 1)))  # perhaps other workers took its places
-        self._plan(stage, place + 1)
+        if stage == len(self._losses) + 1:
+            self._plan(stage, place + 1)
+            # One more each time, so that what is planned for the next stage does not come all at once.
+            if len(self.plans[stage]) < self._size(stage):
+                self._plan(stage, len(self.plans[stage]) + 1)
+            else:
+                self._plan(stage + 1, min(len(self.plans[stage + 1]) + 1, n_random(self.sampler.operations(stage + 1))))
+        else:
+            self._plan_random(stage)
         candidate = self.plans[stage][place]
         if attempt:
-            # Not to repeat what is planned; the random part of the next stage may have been given out already.
-            self._plan(stage, len(self.sampler.operations(stage)))
-            self._plan(stage + 1, n_random(self.sampler.operations(stage + 1)))
-            seen = set(self.seen)
+            # Not to repeat what is planned, as far as it is known however early this is asked for.
+            is_early = stage > 1 and candidate.operation == "random"
+            last = stage if is_early else stage + 1
+            self._plan_random(last)
+            seen = dict.fromkeys(islice(self.seen, self._n_seen[last]))
             for number in range(1, attempt + 1):
                 candidate = self._draw(stage, place, number, seen)
-                seen.add(candidate.loss.canonical())
+                seen[candidate.loss.canonical()] = None
         return candidate
+
+    def _size(self, stage: int) -> int:
+        return len(self.sampler.operations(stage))
+
+    def _plan_random(self, stage: int) -> None:
+        """Plan the whole stage before this one, and of this one what needs no parents."""
+        if stage not in self._n_seen:
+            self._plan(stage - 1, self._size(stage - 1))
+            self._plan(stage, n_random(self.sampler.operations(stage)))
+            self._n_seen[stage] = len(self.seen)
 
     def _plan(self, stage: int, n_places: int) -> None:
         """Plan the first places of a stage, as many as asked for."""
         plan = self.plans[stage]
         while len(plan) < n_places:
-            candidate = self._draw(stage, len(plan), 0, self.seen)
-            self.seen.add(candidate.loss.canonical())
-            plan.append(candidate)
+            plan.append(self._draw(stage, len(plan), 0, self.seen))
+            self.seen[plan[-1].loss.canonical()] = None
 
-    def _draw(self, stage: int, place: int, attempt: int, seen: set[AuxLoss]) -> Candidate:
+    def _draw(self, stage: int, place: int, attempt: int, seen: Container[AuxLoss]) -> Candidate:
         rng = np.random.default_rng([self.seed, stage, place, attempt])
         operation = self.sampler.operations(stage)[place]
-        if self.sampler.screening == 1 or not self.model.n_trials:
+        # What replaces a failed random loss has to be the same before and after the model learns of another stage.
+        if self.sampler.screening == 1 or not self.model.n_trials or (attempt and operation == "random"):
             return self._draw_new(rng, operation, stage, place, seen)
-        offspring: list[Candidate] = []
-        drawn = set(seen)
+        offspring: dict[AuxLoss, Candidate] = {}  # of different canonical forms
         for _ in range(self.sampler.screening):
-            offspring.append(self._draw_new(rng, operation, stage, place, drawn))
-            drawn.add(offspring[-1].loss.canonical())
-        return offspring[self.model.best([candidate.loss for candidate in offspring], self.model.draw(rng))]
+            candidate = self._draw_new(rng, operation, stage, place, seen)
+            offspring.setdefault(candidate.loss.canonical(), candidate)
+        return list(offspring.values())[self.model.best(list(offspring), self.model.draw(rng))]
 
-    def _draw_new(self, rng: np.random.Generator, operation: str, stage: int, place: int, seen: set[AuxLoss]) -> Candidate:
+    def _draw_new(
+        self, rng: np.random.Generator, operation: str, stage: int, place: int, seen: Container[AuxLoss]
+    ) -> Candidate:
         """One offspring, drawn again while it is invalid or was there before."""
         candidate = None
         for _ in range(MAX_DRAWS):
@@ -601,26 +651,17 @@ class _Evolution:
         if operation == "prior":
             prior = space.PRIORS[place % len(space.PRIORS)]
             return Candidate(prior(rng, sampler.max_horizon, sampler.operators), operation)
-        parents = self._parents(stage)
+        parents = self._parents[stage - 2]
         number, loss = parents[rng.integers(len(parents))]
         if operation == "replacement":
             return Candidate(mutations.replacement(loss, rng, sampler.operators), operation, (number,))
         if operation == "horizon_change":
             return Candidate(mutations.horizon_change(loss, rng, sampler.max_horizon), operation, (number,))
-        partners = _partners(number, loss, parents) or _partners(number, loss, self._losses(stage - 1))
+        partners = _partners(number, loss, parents) or _partners(number, loss, self._losses[stage - 2])
         if not partners:
             raise mutations.RejectedLoss(f"no other loss of horizon {loss.horizon} in stage {stage - 1}")
         other_number, other = partners[rng.integers(len(partners))]
         return Candidate(mutations.crossover(loss, other, rng), operation, (number, other_number))
-
-    def _losses(self, stage: int) -> list[tuple[int, AuxLoss]]:
-        return [(trial.number, loss) for trial, loss in self._populations[stage - 1]]
-
-    def _parents(self, stage: int) -> list[tuple[int, AuxLoss]]:
-        losses = dict(self._losses(stage - 1))
-        return [
-            (trial.number, losses[trial.number]) for trial in self.best([trial for trial, _ in self._populations[stage - 2]])
-        ]
 
 
 def _partners(number: int, loss: AuxLoss, losses: Iterable[tuple[int, AuxLoss]]) -> list[tuple[int, AuxLoss]]:

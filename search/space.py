@@ -1,6 +1,7 @@
 """The search space: AuxLoss to and from Optuna parameters, and losses drawn at random and from the paper's priors."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,6 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, IntD
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss, Token
 
 MAX_HORIZON = 10  # paper, section 2.1
-SIDES = ("source", "target")
 Bits = tuple[bool, ...]
 
 
@@ -35,6 +35,16 @@ def check_operators(operators: Sequence[str] | None) -> None:
         raise ValueError(f"operators must be a list of {', '.join(OPERATORS)}, or None; {culprit} is not")
 
 
+@cache
+def token_names(horizon: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """
+    :param horizon: Horizon of a loss
+    :return: Names of the parameters of the source's bits, and of the target's
+    """
+    tokens = [Token.of(index) for index in range(3 * horizon + 1)]
+    return tuple(f"source/{token}" for token in tokens), tuple(f"target/{token}" for token in tokens)
+
+
 def distributions(
     horizon: int, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None
 ) -> dict[str, BaseDistribution]:
@@ -46,9 +56,8 @@ def distributions(
     :param operators: Operators that are searched too, None for mean squared error without negatives (paper, 2.2)
     """
     space: dict[str, BaseDistribution] = {"horizon": IntDistribution(1, max_horizon)}
-    for side in SIDES:
-        for index in range(3 * horizon + 1):
-            space[f"{side}/{Token.of(index)}"] = CategoricalDistribution([False, True])
+    source, target = token_names(horizon)
+    space |= {name: CategoricalDistribution([False, True]) for name in source + target}
     if operators is not None:
         space["operator"] = CategoricalDistribution(list(operators))
         space["negatives"] = CategoricalDistribution([False, True])
@@ -62,9 +71,8 @@ def loss_to_params(loss: AuxLoss, operators: Sequence[str] | None = None) -> dic
     :param loss: The loss
     :param operators: As in :func:`distributions`
     """
-    params: dict[str, Any] = {"horizon": loss.horizon}
-    for side in SIDES:
-        params |= {f"{side}/{Token.of(index)}": bit for index, bit in enumerate(getattr(loss, side))}
+    source, target = token_names(loss.horizon)
+    params = {"horizon": loss.horizon, **dict(zip(source + target, loss.source + loss.target, strict=True))}
     return params if operators is None else {**params, "operator": loss.operator, "negatives": loss.negatives}
 
 
@@ -76,9 +84,8 @@ def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
     :raises KeyError: when parameters are missing
     :raises ValueError: when the loss is not valid
     """
-    horizon = params["horizon"]
-    masks = [tuple(params[f"{side}/{Token.of(index)}"] for index in range(3 * horizon + 1)) for side in SIDES]
-    return AuxLoss(horizon, masks[0], masks[1], params.get("operator", "mse"), params.get("negatives", False))
+    source, target = (tuple(params[name] for name in names) for names in token_names(params["horizon"]))
+    return AuxLoss(params["horizon"], source, target, params.get("operator", "mse"), params.get("negatives", False))
 
 
 def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
@@ -92,6 +99,8 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
     """
     check_operators(operators)
     horizon = trial.suggest_int("horizon", 1, max_horizon)
+    if not 1 <= horizon <= max_horizon:  # Optuna only warns of an enqueued one
+        raise optuna.TrialPruned(f"horizon must be between 1 and {max_horizon}, not {horizon}")
     params: dict[str, Any] = {"horizon": horizon}
     for name, distribution in distributions(horizon, max_horizon, operators).items():
         if isinstance(distribution, CategoricalDistribution):

@@ -8,21 +8,22 @@ from sklearn.linear_model import BayesianRidge
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
 
-def features(loss: AuxLoss, max_horizon: int) -> np.ndarray:
+def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
     """
-    What the model sees of a loss, of its canonical form: the bits of both masks, how many states, actions and rewards
+    What the model sees of losses, of their canonical forms: the bits of both masks, how many states, actions and rewards
     each has (so that tokens of one kind share what they have in common), the horizon, the operator and negatives.
 
-    :param loss: The loss
+    :param losses: The losses
     :param max_horizon: Longest horizon of the space
-    :return: (n_features,) floats
+    :return: (n_losses, n_features) floats
     """
-    loss = loss.canonical()
-    masks = np.zeros((2, 3 * max_horizon + 1))
-    masks[:, : 3 * loss.horizon + 1] = loss.source, loss.target
-    counts = [masks[:, kind::3].sum(axis=1) for kind in range(3)]
-    operator = [float(loss.operator == name) for name in OPERATORS]
-    return np.concatenate([masks.ravel(), *counts, [loss.horizon, *operator, loss.negatives]])
+    losses = [loss.canonical() for loss in losses]
+    masks = np.zeros((len(losses), 2, 3 * max_horizon + 1))
+    for mask, loss in zip(masks, losses, strict=True):
+        mask[:, : 3 * loss.horizon + 1] = loss.source, loss.target
+    counts = [masks[:, :, kind::3].sum(axis=2) for kind in range(3)]
+    others = [[loss.horizon, *(loss.operator == name for name in OPERATORS), loss.negatives] for loss in losses]
+    return np.hstack([masks.reshape(len(losses), -1), *counts, np.array(others, dtype=float)])
 
 
 class TokenModel:
@@ -31,23 +32,22 @@ class TokenModel:
 
     A Bayesian ridge regression depends on its data only through their number and their centred second moments. It is
     fitted to a square root of these, as many rows as there are features, and told of the rows that are missing
-    through its prior: ``alpha_1`` enters the noise precision exactly like half a row.
+    through its prior: ``alpha_1`` enters the noise precision exactly like half a row. Scores are standardised first, so
+    that the choice does not depend on their unit.
 
     :param max_horizon: Longest horizon of the space
     """
 
     def __init__(self, max_horizon: int):
         self.max_horizon = max_horizon
-        n_columns = 6 * max_horizon + 2 + 6 + 1 + len(OPERATORS) + 1
-        # Sums of products of all pairs out of (features, value, 1).
-        self.moments = np.zeros((n_columns + 2, n_columns + 2))
-        self._mean = np.zeros(n_columns)
-        self._root = np.eye(n_columns)
-
-    @property
-    def n_trials(self) -> int:
-        """Number of trials that were added."""
-        return int(self.moments[-1, -1])
+        self.n_trials = 0
+        n_features = 6 * max_horizon + 2 + 6 + 1 + len(OPERATORS) + 1
+        # Of the features and the score, which comes last: means, and sums of products of deviations from them.
+        self.means = np.zeros(n_features + 1)
+        self.moments = np.zeros((n_features + 1, n_features + 1))
+        # The posterior of the weights: its mean, and a square root of its covariance. Before there are data, nothing.
+        self.mean = np.zeros(n_features)
+        self.root = np.eye(n_features)
 
     def add(self, losses: Sequence[AuxLoss], values: Sequence[float]) -> None:
         """
@@ -59,29 +59,32 @@ class TokenModel:
         finite = np.isfinite(values)
         if not finite.any():
             return
-        rows = np.array([features(loss, self.max_horizon) for loss in losses])[finite]
-        rows = np.column_stack([rows, np.asarray(values)[finite], np.ones(len(rows))])
-        self.moments += rows.T @ rows
+        rows = np.column_stack([features(losses, self.max_horizon), values])[finite]
+        shift = rows.mean(axis=0) - self.means
+        deviations = rows - rows.mean(axis=0)
+        weight = len(rows) / (self.n_trials + len(rows))
+        self.moments += deviations.T @ deviations + self.n_trials * weight * np.outer(shift, shift)
+        self.means += weight * shift
+        self.n_trials += len(rows)
         self._fit()
 
     def _fit(self) -> None:
-        n = self.n_trials
-        means = self.moments[-1, :-1] / n
-        centred = self.moments[:-1, :-1] - n * np.outer(means, means)
-        eigenvalues, vectors = np.linalg.eigh(centred)
-        kept = eigenvalues > 1e-9 * eigenvalues[-1]
-        data = np.sqrt(eigenvalues[kept])[:, None] * vectors[:, kept].T
-        variance = centred[-1, -1] / n
-        if variance <= 0 or len(data) < 2:
-            return  # all scores alike, or one trial: nothing to learn yet
-        X, y = data[:, :-1], data[:, -1]
+        deviation = np.sqrt(self.moments[-1, -1] / self.n_trials)
+        if deviation <= 1e-12 * abs(self.means[-1]):
+            return  # all scores alike: nothing to learn
+        unit = np.ones(len(self.means))
+        unit[-1] = deviation
+        moments = self.moments / np.outer(unit, unit)
+        eigenvalues, vectors = np.linalg.eigh(moments)
+        kept = eigenvalues > 1e-12 * eigenvalues[-1]
+        rows = np.sqrt(eigenvalues[kept])[:, None] * vectors[:, kept].T
         ridge = BayesianRidge(
-            alpha_1=1e-6 + (n - len(data)) / 2, alpha_init=1 / variance, lambda_init=1.0, fit_intercept=False
+            alpha_1=1e-6 + (self.n_trials - len(rows)) / 2, alpha_init=1.0, lambda_init=1.0, fit_intercept=False
         )
-        ridge.fit(X, y)
-        precision = ridge.alpha_ * centred[:-1, :-1] + ridge.lambda_ * np.eye(X.shape[1])
-        self._mean = ridge.coef_
-        self._root = np.linalg.inv(np.linalg.cholesky(precision)).T
+        ridge.fit(rows[:, :-1], rows[:, -1])
+        precision = ridge.alpha_ * moments[:-1, :-1] + ridge.lambda_ * np.eye(len(unit) - 1)
+        self.mean = ridge.coef_
+        self.root = np.linalg.inv(np.linalg.cholesky(precision)).T
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
         """
@@ -90,7 +93,7 @@ class TokenModel:
         :param rng: Source of randomness
         :return: (n_features,)
         """
-        return self._mean + self._root @ rng.standard_normal(len(self._mean))
+        return self.mean + self.root @ rng.standard_normal(len(self.mean))
 
     def best(self, losses: Sequence[AuxLoss], weights: np.ndarray) -> int:
         """
@@ -98,4 +101,4 @@ class TokenModel:
         :param weights: A draw of :meth:`draw`
         :return: The place of the one that the weights rate highest
         """
-        return int(np.argmax([features(loss, self.max_horizon) @ weights for loss in losses]))
+        return int(np.argmax(features(losses, self.max_horizon) @ weights))

@@ -4,6 +4,8 @@ import contextlib
 import os
 import platform
 from collections.abc import Iterable
+from datetime import datetime, timedelta
+from functools import cache
 from pathlib import Path
 
 import psutil
@@ -22,10 +24,18 @@ def identity(pid: int | None = None) -> str:
     :param pid: Process number on this machine, None for this process
     :raises psutil.NoSuchProcess: when there is none
     """
-    process = psutil.Process(pid)
-    return f"{_machine()} {process.pid} {process.create_time():.2f}"
+    pid = os.getpid() if pid is None else pid
+    return f"{_machine()} {pid} {_started(pid)}"
 
 
+def _started(pid: int) -> str:
+    """When a process started. On Linux in ticks since the machine did: no change of the clock moves these."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    return f"{psutil.Process(pid).create_time():.2f}"
+
+
+@cache
 def _machine() -> str:
     """Host, boot and process namespace: process numbers of two containers, or from before a reboot, say nothing."""
     parts = [platform.node()]
@@ -48,8 +58,7 @@ def is_dead(worker: str) -> bool:
     if machine != _machine():
         return False
     try:
-        process = psutil.Process(int(pid))
-        return f"{process.create_time():.2f}" != started or process.status() == psutil.STATUS_ZOMBIE
+        return _started(int(pid)) != started or psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
         return True
 
@@ -79,5 +88,14 @@ def fail_dead(study: Study, trials: Iterable[FrozenTrial]) -> int:
     :param trials: Trials to look at
     :return: How many were failed
     """
-    workers = ((trial, trial.user_attrs.get(WORKER_KEY)) for trial in trials if trial.state == TrialState.RUNNING)
-    return sum(fail(study, trial, "its worker died") for trial, worker in workers if worker is not None and is_dead(worker))
+    failed = 0
+    for trial in trials:
+        worker = trial.user_attrs.get(WORKER_KEY)
+        if trial.state != TrialState.RUNNING or worker is None:
+            continue
+        # A heartbeat's copy of a dead trial begins with the name of the dead worker.
+        started = trial.datetime_start or datetime.now()
+        if "failed_trial" in trial.system_attrs and datetime.now() - started < timedelta(seconds=10):
+            continue
+        failed += is_dead(worker) and fail(study, trial, "its worker died")
+    return failed

@@ -1,0 +1,253 @@
+"""
+How good are the losses that a search finds? The samplers on synthetic objectives whose optimum is known.
+
+Every sampler has 500 noisy evaluations; those of its proposals that are no valid loss are pruned and cost nothing. From
+the five losses with the best noisy scores (different canonical forms) the best true value counts, as cross-validation
+would find it. It is normalised: 0 is the mean of random losses, 1 the optimum. The noise of an evaluation is as large as
+the standard deviation of random losses. All objectives look at the canonical form only.
+"""
+
+import argparse
+import json
+import multiprocessing
+import time
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import optuna
+from scipy.stats import mannwhitneyu
+from threadpoolctl import threadpool_limits
+
+from sb3_aarl.aux_loss import AuxLoss, Token
+from search.provenance import provenance
+from search.sampler import AuxLossSampler
+from search.space import MAX_HORIZON, random_loss, suggest_aux_loss
+
+N_TOKENS = 3 * MAX_HORIZON + 1
+SAMPLERS: dict[str, Callable[[int], optuna.samplers.BaseSampler]] = {
+    "random": lambda seed: optuna.samplers.RandomSampler(seed=seed),
+    "nsga2": lambda seed: optuna.samplers.NSGAIISampler(seed=seed),
+    "tpe": lambda seed: optuna.samplers.TPESampler(seed=seed),
+    "paper": lambda seed: AuxLossSampler(seed=seed),
+    "screened": lambda seed: AuxLossSampler(seed=seed, screening=32),
+}
+
+
+class Objective(Protocol):
+    """What a loss is worth, from both masks of its canonical form, and what the best one is worth."""
+
+    optimum: float
+
+    def __call__(self, source: np.ndarray, target: np.ndarray) -> float: ...
+
+
+class Tokens:
+    """Each token has a value of its own around the value of its kind: signs as in the paper's table 5 (Cheetah-Run)."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(1)
+        by_kind = {"s": (-0.3, 1.0), "a": (0.4, -0.7), "r": (0.2, -0.5)}  # in source and target
+        kinds = np.array([by_kind[Token.of(i).kind] for i in range(N_TOKENS)]).T
+        self.weights = kinds + rng.normal(0, 0.4, kinds.shape)
+        self.weights *= 0.8 ** (np.arange(N_TOKENS) // 3)  # what is far away matters less
+        self.weights[0, 0] = 1.0  # s_t is in the optimum, which makes it a valid and canonical one
+        self.optimum = float(self.weights[self.weights > 0].sum())
+
+    def __call__(self, source: np.ndarray, target: np.ndarray) -> float:
+        return float(self.weights[0] @ source + self.weights[1] @ target)
+
+
+class Patterns:
+    """Gains and losses for whole patterns (paper, section 3.3), at some offsets, and a price for every token."""
+
+    PRICE = 0.05
+    PATTERNS = (
+        ("{s_t, a_t} -> {s_t+1}", 3.0),  # forward dynamics
+        ("{s_t, a_t, a_t+1} -> {s_t+2}", 3.0),
+        ("{s_t, a_t, a_t+1, a_t+2} -> {s_t+3}", 2.0),
+        ("{s_t} -> {s_t+2, s_t+3}", 1.5),
+        ("{s_t, r_t} -> {s_t+1}", 1.0),
+        ("{s_t, a_t} -> {s_t+4, s_t+5}", 1.0),
+        ("{s_t+1, a_t} -> {s_t}", -1.0),  # inverse dynamics
+        ("{s_t, a_t} -> {r_t}", -1.5),  # reward prediction
+        ("{s_t, s_t+1} -> {a_t}", -3.0),  # action inference
+        ("{s_t} -> {s_t}", -2.0),  # reconstruction
+        ("{s_t+1} -> {s_t+1}", -1.0),
+    )
+
+    def __init__(self) -> None:
+        self.patterns = [(*_masks(AuxLoss.parse(text)), gain) for text, gain in self.PATTERNS]
+        gains = [(source, target) for source, target, gain in self.patterns if gain > 0]
+        # Tokens that belong to no pattern with a gain only cost: the optimum is the union of some of these patterns.
+        unions = (
+            (np.any([s for s, _ in chosen], axis=0), np.any([t for _, t in chosen], axis=0))
+            for size in range(1, len(gains) + 1)
+            for chosen in combinations(gains, size)
+        )
+        self.optimum = max(self(source, target) for source, target in unions)
+
+    def __call__(self, source: np.ndarray, target: np.ndarray) -> float:
+        value = -self.PRICE * (source.sum() + target.sum())
+        for needed_source, needed_target, gain in self.patterns:
+            value += gain * (source[needed_source].all() and target[needed_target].all())
+        return float(value)
+
+
+class Pairs:
+    """Half of the value lies in single tokens that are as in a hidden loss, half in pairs that both have to be."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(3)
+        self.hidden = (rng.random(2 * N_TOKENS) < 0.4) & (np.tile(np.arange(N_TOKENS), 2) < 22)  # horizon 7
+        self.hidden[0] = self.hidden[N_TOKENS + 21] = True
+        self.single = rng.exponential(size=2 * N_TOKENS)
+        self.pairs = np.array([rng.choice(2 * N_TOKENS, size=2, replace=False) for _ in range(60)])
+        self.double = rng.exponential(size=60)
+        self.double *= self.single.sum() / self.double.sum()
+        self.optimum = float(self.single.sum() + self.double.sum())
+
+    def __call__(self, source: np.ndarray, target: np.ndarray) -> float:
+        right = np.concatenate([source, target]) == self.hidden
+        return float(self.single @ right + self.double @ right[self.pairs].all(axis=1))
+
+
+class Shape:
+    """What matters is the horizon and the shares of each kind of token, whichever they are."""
+
+    optimum = 5.0
+
+    def __call__(self, source: np.ndarray, target: np.ndarray) -> float:
+        horizon = max(1, -(-int(np.flatnonzero(source | target)[-1]) // 3))
+        value = 2.0 * target[::3].sum() / (horizon + 1) - 1.0 * (source[::3].sum() - 1) / horizon
+        value += 1.5 * source[1::3].sum() / horizon - 1.0 * target[1::3].sum() / horizon
+        value += 1.5 * (1 - target[2::3].sum() / horizon)
+        return float(value - 0.3 * abs(horizon - 5))
+
+
+class Product:
+    """A product of how complete the source is, how complete the target is, and how little else there is."""
+
+    optimum = 1.0
+
+    def __init__(self) -> None:
+        self.source, self.target = _masks(
+            AuxLoss.parse("{s_t, a_t, a_t+1, a_t+2, a_t+3, r_t+1, s_t+2} -> {s_t+1, s_t+3, s_t+4, r_t+3}")
+        )
+
+    def __call__(self, source: np.ndarray, target: np.ndarray) -> float:
+        surplus = (source & ~self.source).sum() + (target & ~self.target).sum()
+        needed = (0.2 + 0.8 * source[self.source].mean()) * (0.2 + 0.8 * target[self.target].mean())
+        return float(needed * 0.95**surplus)
+
+
+OBJECTIVES: dict[str, Callable[[], Objective]] = {
+    "tokens": Tokens,
+    "patterns": Patterns,
+    "pairs": Pairs,
+    "shape": Shape,
+    "product": Product,
+}
+
+
+def _masks(loss: AuxLoss) -> tuple[np.ndarray, np.ndarray]:
+    """Both masks of the canonical form, as long as the longest horizon needs."""
+    loss = loss.canonical()
+    masks = np.zeros((2, N_TOKENS), dtype=bool)
+    masks[:, : len(loss.source)] = loss.source, loss.target
+    return masks[0], masks[1]
+
+
+def run(cell: tuple[str, str, int, int]) -> dict[str, float | int | str]:
+    """One search; the true value of the best of its top five, normalised."""
+    objective_name, sampler_name, seed, n_evaluations = cell
+    started = time.process_time()
+    threadpool_limits(1)
+    objective = OBJECTIVES[objective_name]()
+    rng = np.random.default_rng(0)
+    at_random = [objective(*_masks(random_loss(rng))) for _ in range(5000)]
+    mean, deviation = float(np.mean(at_random)), float(np.std(at_random))
+
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    study = optuna.create_study(direction="maximize", sampler=SAMPLERS[sampler_name](seed))
+    noise = np.random.default_rng([seed, 1])
+    scores: dict[AuxLoss, tuple[float, float]] = {}
+    n_done = n_invalid = 0
+    while n_done < n_evaluations:
+        trial = study.ask()
+        try:
+            loss = suggest_aux_loss(trial).canonical()
+        except optuna.TrialPruned:
+            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+            n_invalid += 1
+            continue
+        value = objective(*_masks(loss))
+        score = value + deviation * noise.standard_normal()
+        study.tell(trial, score)
+        scores[loss] = max(scores.get(loss, (-np.inf, value)), (score, value))
+        n_done += 1
+    top_five = sorted(scores.values(), reverse=True)[:5]
+    best = (max(value for _, value in top_five) - mean) / (objective.optimum - mean)
+    seconds = time.process_time() - started
+    key: dict[str, float | int | str] = {"objective": objective_name, "sampler": sampler_name, "seed": seed}
+    return {**key, "best": best, "different": len(scores), "invalid": n_invalid, "seconds": round(seconds, 2)}
+
+
+def report(cells: list[dict]) -> dict:
+    """Print means and deviations, and Mann-Whitney's two-sided p for every pair; also over all objectives at once."""
+    tables: dict = {}
+    for objective in [*OBJECTIVES, "all"]:
+        found = [cell for cell in cells if objective in ("all", cell["objective"])]
+        values = {name: [cell["best"] for cell in found if cell["sampler"] == name] for name in SAMPLERS}
+        values = {name: those for name, those in values.items() if those}
+        if not values:
+            continue
+        print(f"\n{objective:10} {'n':>4} {'mean':>7} {'dev.':>6}   p against " + " ".join(f"{name:>9}" for name in values))
+        tables[objective] = {}
+        for name, those in values.items():
+            p = {other: float(mannwhitneyu(those, values[other]).pvalue) for other in values if other != name}
+            row = {"n": len(those), "mean": float(np.mean(those)), "deviation": float(np.std(those)), "p": p}
+            tables[objective][name] = row
+            marks = " ".join(f"{p[other]:9.2g}" if other in p else f"{'-':>9}" for other in values)
+            print(f"{name:10} {row['n']:4} {row['mean']:7.3f} {row['deviation']:6.3f}   {'':9} {marks}")
+    return tables
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--evaluations", type=int, default=500)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--objectives", nargs="+", default=list(OBJECTIVES), choices=OBJECTIVES)
+    parser.add_argument("--samplers", nargs="+", default=list(SAMPLERS), choices=SAMPLERS)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--out", type=Path, help="JSON with all cells; what it has already is not run again")
+    args = parser.parse_args()
+
+    done: list[dict] = []
+    if args.out and args.out.exists():
+        before = json.loads(args.out.read_text())
+        if before["evaluations"] != args.evaluations:
+            parser.error(f"{args.out} has {before['evaluations']} evaluations, not {args.evaluations}")
+        done = before["cells"]
+    known = {(cell["objective"], cell["sampler"], cell["seed"]) for cell in done}
+    wanted = [(o, s, seed) for seed in range(args.seeds) for s in args.samplers for o in args.objectives]
+    todo = [(*key, args.evaluations) for key in wanted if key not in known]
+    # Started anew, not forked: the children of a process with threads would hang now and then.
+    with multiprocessing.get_context("spawn").Pool(args.processes) as pool:
+        for cell in pool.imap_unordered(run, todo):
+            done.append(cell)
+            print(f"{len(done)}/{len(known) + len(todo)}", cell, flush=True)
+            if args.out:
+                args.out.parent.mkdir(parents=True, exist_ok=True)
+                args.out.write_text(json.dumps({"evaluations": args.evaluations, "cells": done}))
+    done.sort(key=lambda cell: (cell["objective"], cell["sampler"], cell["seed"]))
+    tables = report(done)
+    if args.out:
+        result = {**provenance(), "evaluations": args.evaluations, "tables": tables, "cells": done}
+        args.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
