@@ -1,0 +1,191 @@
+"""Learning curves: evaluated exactly where they should be, repeatable, and without an influence on training."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_aarl import SACAux
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, aulc, read_curve, write_curve
+from sb3_aarl.envs import RepeatAction
+
+
+class Walk(gym.Env):
+    """A random walk of 7 steps; the reward is where it is. Remembers with which seeds it was reset."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self) -> None:
+        self.starts: list[np.ndarray] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.left = 7
+        self.point = self.np_random.normal(size=2).astype(np.float32)
+        self.starts.append(self.point)
+        return self.point, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.left -= 1
+        self.point = (self.point + 0.1 * action + 0.1 * self.np_random.normal(size=2)).astype(np.float32)
+        return self.point, float(self.point[0]), False, self.left == 0, {}
+
+
+def make_model(env: Any, **kwargs: Any) -> SACAux:
+    policy_kwargs = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8, "width": 8}}
+    arguments = {"buffer_size": 200, "learning_starts": 5, "batch_size": 8, "predictor_width": 8, "seed": 0, "device": "cpu"}
+    return SACAux("MlpPolicy", env, aux_loss="forward-dynamics", policy_kwargs=policy_kwargs, **{**arguments, **kwargs})
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "action_repeat", "checkpoints", "at"),
+    [
+        (1, 1, [5, 6, 20], [5, 6, 20]),
+        (1, 3, [9, 30], [3, 10]),
+        # With two environments an odd checkpoint is passed, by one step, and two checkpoints may be passed at once.
+        (2, 1, [5, 6, 20], [6, 6, 20]),
+        (2, 3, [12, 30], [4, 10]),
+    ],
+)
+def test_evaluates_at_the_checkpoints(n_envs: int, action_repeat: int, checkpoints: list[int], at: list[int]) -> None:
+    def make_env() -> gym.Env:
+        return RepeatAction(Walk(), action_repeat) if action_repeat > 1 else Walk()
+
+    agent_steps: list[int] = []
+    told: list[Evaluation] = []
+    model = make_model(DummyVecEnv([make_env] * n_envs))
+
+    def on_evaluation(evaluation: Evaluation) -> None:
+        agent_steps.append(model.num_timesteps)
+        told.append(evaluation)
+
+    callback = LearningCurveCallback(make_env(), checkpoints, 2, on_evaluation=on_evaluation)
+    model.learn(checkpoints[-1] // action_repeat, callback)
+    assert agent_steps == at
+    assert [evaluation.environment_steps for evaluation in callback.curve] == checkpoints
+    assert told == callback.curve
+    assert callback.aulc == aulc(told) == pytest.approx(sum(evaluation.mean for evaluation in told) / len(told))
+    assert all(evaluation.episodes == 2 for evaluation in told)
+
+
+def test_the_returns_are_those_of_deterministic_episodes_from_seeded_states() -> None:
+    model = make_model(Walk())
+    expected: list[tuple[float, float]] = []
+
+    def play(_: Evaluation) -> None:
+        env = Walk()
+        returns = []
+        for episode in range(3):
+            # Only the first reset is seeded, as in a VecEnv.
+            observation, _ = env.reset(seed=40 + 1000 * len(expected) if episode == 0 else None)
+            total, over = 0.0, False
+            while not over:
+                action, _ = model.predict(observation, deterministic=True)
+                observation, reward, _, over, _ = env.step(action)
+                total += reward
+            returns.append(total)
+        expected.append((np.mean(returns), np.std(returns)))
+
+    callback = LearningCurveCallback(Walk(), [10, 30], 3, seed=40, on_evaluation=play)
+    model.learn(30, callback)
+    np.testing.assert_allclose([(point.mean, point.std) for point in callback.curve], expected, rtol=1e-5, atol=1e-5)
+
+
+def parameters_after(checkpoints: list[int] | None, episodes: int = 3) -> list[th.Tensor]:
+    model = make_model(Walk())
+    model.learn(40, None if checkpoints is None else LearningCurveCallback(Walk(), checkpoints, episodes))
+    return [*model.policy.parameters(), *model.aux_head.parameters()]
+
+
+def test_an_evaluation_does_not_disturb_training() -> None:
+    plain = parameters_after(None)
+    watched = parameters_after([10, 11, 25, 40])
+    assert all(th.equal(*pair) for pair in zip(plain, watched, strict=True))
+
+
+def test_a_resumed_curve_goes_on_with_the_same_initial_states() -> None:
+    whole_env = Walk()
+    whole = LearningCurveCallback(whole_env, [10, 20, 30], 2, seed=3)
+    make_model(Walk()).learn(30, whole)
+
+    resumed_env = Walk()
+    resumed = LearningCurveCallback(resumed_env, [10, 20, 30], 2, seed=3, curve=whole.curve[:2])
+    model = make_model(Walk())
+    model.num_timesteps = 20
+    model.learn(10, resumed, reset_num_timesteps=False)
+    assert resumed.curve[:2] == whole.curve[:2]
+    assert [point.environment_steps for point in resumed.curve] == [10, 20, 30]
+    assert resumed.curve[2].seconds >= whole.curve[1].seconds
+    # A VecEnv resets once more behind the last episode of an evaluation.
+    np.testing.assert_array_equal(resumed_env.starts[:2], whole_env.starts[6:8])
+    assert len(whole_env.starts) == 9
+
+
+def test_training_ends_when_the_function_says_false() -> None:
+    model = make_model(Walk())
+    callback = LearningCurveCallback(Walk(), [10, 20, 30], 1, on_evaluation=lambda point: point.environment_steps < 20)
+    model.learn(30, callback)
+    assert model.num_timesteps == 20
+    assert len(callback.curve) == 2
+
+
+def test_normalized_environments_share_their_statistics() -> None:
+    env, eval_env = (VecNormalize(DummyVecEnv([Walk])) for _ in range(2))
+    eval_env.training, eval_env.norm_reward = False, False
+    model = make_model(env)
+    model.learn(30, LearningCurveCallback(eval_env, [30], 1))
+    np.testing.assert_array_equal(eval_env.obs_rms.mean, env.obs_rms.mean)
+    assert env.obs_rms.mean.any()
+
+
+@pytest.mark.parametrize(
+    ("checkpoints", "kwargs", "culprit"),
+    [
+        ([], {}, "checkpoints"),
+        ([5, 5], {}, "checkpoints"),
+        ([5, 4], {}, "checkpoints"),
+        ([0, 4], {}, "checkpoints"),
+        ([5], {"action_repeat": 2}, "checkpoint 5"),
+        ([5], {"n_eval_episodes": 0}, "n_eval_episodes"),
+    ],
+)
+def test_what_does_not_fit_is_refused(checkpoints: list[int], kwargs: dict[str, int], culprit: str) -> None:
+    with pytest.raises(ValueError, match=culprit):
+        LearningCurveCallback(Walk(), checkpoints, **kwargs)
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+evaluations = st.builds(Evaluation, st.integers(1, 10**9), finite, finite, st.integers(1, 100), finite)
+
+
+@given(st.lists(evaluations, max_size=5), st.lists(evaluations, max_size=5))
+@settings(max_examples=50, deadline=None)
+def test_a_curve_is_read_as_it_was_written(
+    tmp_path_factory: pytest.TempPathFactory, before: list[Evaluation], curve: list[Evaluation]
+) -> None:
+    path = tmp_path_factory.mktemp("curve") / "new" / "curve.csv"
+    write_curve(path, before)
+    write_curve(path, curve)
+    assert read_curve(path) == curve
+    assert [file.name for file in path.parent.iterdir()] == ["curve.csv"]
+
+
+def test_the_file_has_every_evaluation_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "curve.csv"
+    rows: list[list[dict[str, str]]] = []
+
+    def read(_: Evaluation) -> None:
+        with path.open() as file:
+            rows.append(list(csv.DictReader(file)))
+
+    make_model(Walk()).learn(20, LearningCurveCallback(Walk(), [10, 20], 1, path=path, on_evaluation=read))
+    assert [[row["environment_steps"] for row in table] for table in rows] == [["10"], ["10", "20"]]
