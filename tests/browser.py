@@ -33,13 +33,15 @@ def open_browser(profile: Path) -> Iterator[Chrome]:
     options.set_capability("goog:loggingPrefs", {"performance": "ALL", "browser": "ALL"})
     browser = Chrome(options=options, service=Service(driver))
     try:
+        browser.get("about:blank")
+        requested(browser)  # of the browser's own first page
         yield browser
     finally:
         browser.quit()
 
 
 def requested(browser: Chrome) -> list[str]:
-    """Addresses that the pages asked for since the last call, without those whose data they brought along."""
+    """Addresses that the pages asked for since the last call, without those that need no network."""
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     urls = [message["params"]["request"]["url"] for message in messages if message["method"] == "Network.requestWillBeSent"]
-    return [url for url in urls if not url.startswith(("data:", "blob:"))]
+    return [url for url in urls if not url.startswith(("data:", "blob:", "chrome:"))]

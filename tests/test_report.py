@@ -1,0 +1,211 @@
+"""The report of a study, and the notation typeset: parsed, and opened in a real browser."""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from datetime import datetime, timedelta
+
+import lxml.html
+import numpy as np
+import optuna
+import pytest
+from browser import open_browser, requested
+from hypothesis import given
+from hypothesis import strategies as st
+from optuna.distributions import FloatDistribution
+from optuna.trial import FrozenTrial, TrialState
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import WebDriverWait
+
+from sb3_aarl.aux_loss import OPERATORS, AuxLoss
+from search.notation import mathml, subscripts
+from search.report import stage_rows, time_spent, write_report
+from search.sampler import AuxLossSampler
+from search.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+
+START = datetime(2026, 1, 1)
+EVIL = "<script>document.title='owned'</script><img src=https://example.org/x.png>"
+
+
+@st.composite
+def losses(draw):
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    return random_loss(rng, operators=OPERATORS)
+
+
+@given(losses())
+def test_mathml_reads_as_the_notation(loss):
+    """Read back with an XML parser: every token a base with a subscript, in the order of the notation."""
+
+    def read(element):
+        if element.tag == "msub":
+            base, subscript = element
+            return f"{base.text}_{''.join(subscript.itertext())}"
+        return (element.text or "") + "".join(read(child) + (child.tail or "") for child in element)
+
+    text = read(ElementTree.fromstring(f"<p>{mathml(loss)}</p>"))
+    assert AuxLoss.parse(text) == loss
+
+
+@given(losses())
+def test_subscripts_read_as_the_notation(loss):
+    plain = subscripts(loss).translate(str.maketrans("ₜ₊₀₁₂₃₄₅₆₇₈₉", "t+0123456789"))
+    assert AuxLoss.parse(re.sub(r"\b([sar])t", r"\1_t", plain)) == loss
+
+
+def make_trial(number, state, value, seconds, loss=None, **attrs):
+    loss = loss or random_loss(np.random.default_rng(number), 3)
+    return FrozenTrial(
+        number=number,
+        state=state,
+        value=value,
+        datetime_start=START,
+        datetime_complete=START + timedelta(seconds=seconds) if state.is_finished() else None,
+        params=loss_to_params(loss),
+        distributions=distributions(loss.horizon),
+        user_attrs=attrs,
+        system_attrs={},
+        intermediate_values={},
+        trial_id=number,
+    )
+
+
+@pytest.fixture
+def study():
+    """30 trials over three stages: every fourth failed, every fifth of the others pruned, the last two run."""
+    study = optuna.create_study(study_name=f"study {EVIL}", direction="maximize")
+    rng = np.random.default_rng(3)
+    for number in range(30):
+        state = TrialState.FAIL if number % 4 == 3 else TrialState.PRUNED if number % 5 == 4 else TrialState.COMPLETE
+        state = TrialState.RUNNING if number >= 28 else state
+        stage = number // 10 + 1
+        value = float(rng.normal(100 * stage, 50)) if state == TrialState.COMPLETE else None
+        attrs = {"stage": stage, "place": number % 10 % 8, "operation": "horizon_change" if stage > 1 else "random"}
+        attrs |= {"parents": [int(rng.integers(10 * (stage - 2), 10 * (stage - 1)))] if stage > 1 else []}
+        attrs |= {"curve": [[1000, 10.0, 1.0], [2000, 20.0, 2.0]]} if number % 3 == 0 else {}
+        study.add_trial(make_trial(number, state, value, 60 + number, **attrs))
+    return study
+
+
+def completed(study):
+    return sorted((t for t in study.trials if t.state == TrialState.COMPLETE), key=lambda trial: -trial.value)
+
+
+def read_page(path):
+    page = lxml.html.parse(str(path)).getroot()
+    for script in page.xpath("//script"):
+        script.drop_tree()
+    return page
+
+
+def table_after(page, heading):
+    table = page.xpath(f"//h2[normalize-space()='{heading}']/following-sibling::table[1]")[0]
+    return [[cell.text_content().strip() for cell in row.xpath("./td")] for row in table.xpath(".//tr[td]")]
+
+
+def test_stages_and_time(study):
+    for row in stage_rows(study):
+        of_stage = [trial for trial in study.trials if trial.user_attrs["stage"] == row.stage]
+        states = [trial.state for trial in of_stage]
+        scores = [trial.value for trial in of_stage if trial.state == TrialState.COMPLETE]
+        assert row.places == 8
+        assert row.completed == len(scores) and row.best == max(scores)
+        assert row.mean == pytest.approx(np.mean(scores))
+        assert row.failed == states.count(TrialState.FAIL) and row.pruned == states.count(TrialState.PRUNED)
+        assert row.running == states.count(TrialState.RUNNING)
+    assert [row.stage for row in stage_rows(study)] == [1, 2, 3]
+    assert time_spent(study.trials) == timedelta(seconds=sum(60 + number for number in range(28)))
+
+
+def test_places_of_a_search():
+    sampler = AuxLossSampler(population_size=3, n_random=4, n_prior=1, seed=0)
+    study = optuna.create_study(sampler=sampler, direction="minimize")
+    study.optimize(lambda trial: float(suggest_aux_loss(trial).horizon), n_trials=7)
+    rows = stage_rows(study)
+    assert [(row.places, row.completed) for row in rows] == [(5, 5), (3, 2)]
+    assert rows[0].best == min(trial.value for trial in study.trials[:5])
+
+
+def test_what_the_report_says(study, tmp_path):
+    path = tmp_path / "deep" / "report.html"
+    write_report(study, path, [("SAC & co", 150.0)], {"environment": EVIL}, {"commit": "abc123", "cpu": "2 cores"})
+    page = read_page(path)
+    text = " ".join(page.text_content().split())
+    best = completed(study)
+    states = [trial.state for trial in study.trials]
+    counts = [states.count(state) for state in (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL, TrialState.RUNNING)]
+    summary = "30 trials: {} completed, {} pruned, {} failed, {} running or waiting.".format(*counts)
+    assert summary in text and "took 34 min 18 s together" in text
+    rows = table_after(page, "Best losses")
+    assert [row[:2] for row in rows] == [[f"{trial.value:.1f}", str(trial.number)] for trial in best[:10]]
+    for row, trial in zip(rows, best, strict=False):
+        assert row[2] == str(trial.user_attrs["stage"]) and row[3] == trial.user_attrs["operation"].replace("_", " ")
+        assert row[4] == (", ".join(map(str, trial.user_attrs["parents"])) or "–")
+    parents, number = [], best[0].number
+    while study.trials[number].user_attrs["parents"]:
+        number = study.trials[number].user_attrs["parents"][0]
+        parents.append(str(number))
+    assert parents and [row[1] for row in table_after(page, "Lineage of the best")] == parents
+    assert table_after(page, "Baselines") == [["SAC & co", "150.0"]]
+    assert table_after(page, "Settings") == [["environment", EVIL]]
+    assert table_after(page, "Where it comes from") == [["commit", "abc123"], ["cpu", "2 cores"]]
+    assert page.xpath("//h2[normalize-space()='Learning curves']")
+    assert not page.xpath("//img | //link | //iframe | //*[@src]")
+
+
+@pytest.mark.parametrize("states", [[], [TrialState.FAIL, TrialState.RUNNING]])
+def test_report_of_nothing(tmp_path, states):
+    study = optuna.create_study(study_name="nothing")
+    for number, state in enumerate(states):
+        study.add_trial(make_trial(number, state, None, 1))
+    write_report(study, tmp_path / "report.html")
+    text = " ".join(read_page(tmp_path / "report.html").text_content().split())
+    expected = "No trial has a score yet." if states else "This study is empty: no trial has begun yet."
+    assert expected in text
+    assert ("1 failed, 1 running or waiting" in text) == bool(states)
+    assert "Best losses" not in text
+
+
+def test_report_of_another_sampler(tmp_path):
+    """Trials without a loss, a stage or an operation have a report too; the lowest is the best here."""
+    study = optuna.create_study(direction="minimize")
+    for value in (2.0, 1.0):
+        trial = study.ask({"x": FloatDistribution(0, 1)})
+        study.tell(trial, value)
+    write_report(study, tmp_path / "report.html")
+    rows = table_after(read_page(tmp_path / "report.html"), "Best losses")
+    assert rows == [["1.0", "1", "1", "-", "–", "no loss"], ["2.0", "0", "1", "-", "–", "no loss"]]
+
+
+def test_in_a_real_browser(study, tmp_path):
+    path = tmp_path / "report.html"
+    best = completed(study)
+    write_report(study, path, [("SAC", 150.0), ("CURL", 180.0)], {"environment": EVIL}, {"commit": "abc123"})
+    with open_browser(tmp_path / "profile") as browser:
+        browser.get(path.as_uri())
+        wait = WebDriverWait(browser, 30)
+        evolution, curves = wait.until(lambda _: browser.find_elements(By.CLASS_NAME, "js-plotly-plot"))
+
+        def points(plot):
+            """Points of the first trace."""
+            return len(plot.find_elements(By.CSS_SELECTOR, ".scatterlayer .trace:first-child .points path"))
+
+        wait.until(lambda _: points(evolution) == len(best))
+        assert all(name in evolution.text for name in ("Stage", "Score", "SAC", "CURL"))
+        with_curve = [trial for trial in best[:5] if "curve" in trial.user_attrs]
+        assert with_curve and all(f"trial {trial.number}" in curves.text for trial in with_curve)
+        wait.until(lambda _: points(curves) == 2)
+        # Typeset: a subscript is set lower and smaller than what it belongs to.
+        base, subscript = browser.find_element(By.CSS_SELECTOR, ".winner msub").find_elements(By.XPATH, "./*")
+        bottom = {part: part.rect["y"] + part.rect["height"] for part in (base, subscript)}
+        assert bottom[subscript] > bottom[base]
+        size = [float(part.value_of_css_property("font-size")[:-2]) for part in (base, subscript)]
+        assert size[1] < size[0]
+        assert browser.title.startswith("study <script>")
+        assert [trial.number for trial in best[:10]] == [
+            int(row.find_elements(By.TAG_NAME, "td")[1].text)
+            for row in browser.find_elements(By.XPATH, "//h2[.='Best losses']/following-sibling::table[1]/tbody/tr")
+        ]
+        width = browser.execute_script("return [document.documentElement.scrollWidth, window.innerWidth]")
+        assert width[0] <= width[1]  # nothing runs out of the page
+        assert requested(browser) == [path.as_uri()]
+        assert browser.get_log("browser") == []
