@@ -1,0 +1,322 @@
+"""The program ``aarl``. What the commands do lies elsewhere; imports that take seconds are made when they are needed."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.console import Console, RenderableType
+from rich.live import Live
+from rich.markup import escape
+from rich.progress import MofNCompleteColumn
+from rich.progress import Progress as ProgressBar
+from rich.table import Table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from search.evolve import Progress
+    from search.grid import Grid
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__.partition("\n")[0])
+console = Console()
+errors = Console(stderr=True, soft_wrap=True)
+
+ZOO = Path(__file__).parent.parent / "zoo_configs"
+
+
+@app.callback()
+def program() -> None:
+    """Auxiliary losses for reinforcement learning: train with one, search for better ones."""
+
+
+@contextlib.contextmanager
+def clear_errors() -> Iterator[None]:
+    """What a user can mend is one line and exit code 2, not a traceback; Ctrl-C is exit code 130."""
+    from search.training import TrainingError
+
+    # dm_control's models use what MuJoCo calls deprecated, and it says so every time that one is made.
+    logging.getLogger("absl").setLevel(logging.ERROR)
+    try:
+        yield
+    except (ValueError, OSError, TrainingError) as error:
+        errors.print(f"Error: {' '.join(str(error).split())}", style="red", markup=False, highlight=False)
+        raise typer.Exit(2) from None
+    except KeyboardInterrupt:
+        errors.print("Interrupted. The same command goes on from the last checkpoint.", markup=False)
+        raise typer.Exit(130) from None
+
+
+@app.command()
+def train(
+    env: Annotated[str, typer.Argument(help="Such as cheetah-run, dm_control/cheetah-run-v0 or Pendulum-v1.")],
+    aux_loss: Annotated[
+        str | None,
+        typer.Option(help="Notation, name of the catalogue, 'none' or 'auto'. Default: the file's, or auto."),
+    ] = None,
+    config: Annotated[Path, typer.Option(help="File of hyper-parameters.", show_default="zoo_configs/aarl_state.yml")] = ZOO
+    / "aarl_state.yml",
+    steps: Annotated[
+        int | None,
+        typer.Option(help="Environment steps (agent steps x action repeat). Default: the file's n_timesteps."),
+    ] = None,
+    evaluations: Annotated[int, typer.Option(help="Number of evaluations, equally spaced.")] = 5,
+    episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 10,
+    seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for model and learning curve. Default: in runs/."),
+    ] = None,
+) -> None:
+    """Train with one auxiliary loss. Killed, the same command goes on from its last evaluation."""
+    with clear_errors():
+        from search.training import train_and_keep
+
+        run, folder = train_and_keep(env, aux_loss, config, steps, evaluations, episodes, seed, out)
+        table = Table("environment steps", "mean return", "deviation", "seconds", title=f"AULC {run.aulc:.1f}")
+        for column in table.columns:
+            column.justify = "right"
+        for point in run.curve:
+            table.add_row(f"{point.environment_steps:,}", f"{point.mean:.1f}", f"{point.std:.1f}", f"{point.seconds:.0f}")
+        console.print(table)
+        console.print(f"Model: {folder / 'model.zip'}\nCurve: {folder / 'curve.csv'}", soft_wrap=True, highlight=False)
+
+
+@app.command()
+def losses() -> None:
+    """List the losses that have a name."""
+    from sb3_aarl import catalog
+
+    table = Table("name", "notation", "operator")
+    table.columns[1].overflow = "fold"
+    for name in catalog.names():
+        loss = catalog.load(name)
+        operator = f"{loss.operator}, negatives" if loss.negatives else loss.operator
+        # The brackets behind a notation hold the operator; rich would take them for markup.
+        table.add_row(name, str(loss).partition(" [")[0], operator)
+    console.print(table)
+
+
+Storage = Annotated[
+    str | None,
+    typer.Option(help="URL of a database, such as sqlite:///study.db. Default: a journal in the folder."),
+]
+Folder = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the search. Default: runs/NAME, NAME being that of the configuration file."),
+]
+Workers = Annotated[int, typer.Option(help="Processes that train at the same time.", min=1)]
+SearchFile = Annotated[Path, typer.Argument(help="Configuration of a search, such as zoo_configs/search/demo.yml.")]
+
+
+def run_folder(config: Path, folder: Path | None) -> Path:
+    """Where a search keeps what it makes."""
+    return Path("runs") / config.stem if folder is None else folder
+
+
+@app.command()
+def search(
+    config: SearchFile,
+    storage: Storage = None,
+    workers: Workers = 1,
+    stages: Annotated[int | None, typer.Option(help="Number of stages. Default: the file's.", min=1)] = None,
+    pruner: Annotated[
+        Literal["none", "median", "hyperband"] | None, typer.Option(help="Optuna's pruner. Default: the file's.")
+    ] = None,
+    folder: Folder = None,
+) -> None:
+    """Search for losses by evolution. Ctrl-C stops it, the same command goes on with it."""
+    with clear_errors():
+        from search import evolve
+        from search.config import load_config
+        from search.storage import without_password
+
+        changes: dict[str, Any] = {"stages": stages, "pruner": pruner}
+        settings = replace(load_config(config), **{key: value for key, value in changes.items() if value is not None})
+        path = run_folder(config, folder)
+        where = storage or str(path)
+        console.print(f"Study {evolve.study_name(settings)} in {without_password(where)}", soft_wrap=True, markup=False)
+        shown: evolve.Progress | None = None
+        with live() as show:
+            for progress in evolve.search(settings, path, where, workers):
+                # Without a terminal there is a line for everything that has changed.
+                if console.is_terminal or shown is None or progress.stages != shown.stages:
+                    show(_stages_table(progress) if console.is_terminal else _stages_line(progress))
+                shown = progress
+        if shown is not None and shown.best is not None:
+            console.print(f"Best so far: {shown.best_loss}, score {shown.best:.2f}", markup=False, soft_wrap=True)
+        console.print(f"To watch it: aarl dashboard {path}", markup=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def live() -> Iterator[Callable[[RenderableType], None]]:
+    """Something that shows what it is given: in one place of a terminal, line by line elsewhere."""
+    if not console.is_terminal:
+        yield lambda shown: console.print(shown, soft_wrap=True, highlight=False)
+        return
+    with Live(console=console, refresh_per_second=2) as display:
+        yield display.update
+
+
+def _stages_table(progress: "Progress") -> Table:
+    togo = "?" if progress.seconds_to_go is None else str(timedelta(seconds=round(progress.seconds_to_go)))
+    best = "-" if progress.best is None else f"{progress.best:.2f}"
+    table = Table("stage", "places", "done", "running", "failed", title=f"best {best}, {togo} to go")
+    for column in table.columns:
+        column.justify = "right"
+    for stage in progress.stages:
+        table.add_row(*(str(number) for number in stage))
+    return table
+
+
+def _stages_line(progress: "Progress") -> str:
+    stages = (f"stage {s.stage}: {s.filled}/{s.places} done, {s.running} running, {s.failed} failed" for s in progress.stages)
+    best = "" if progress.best is None else f"; best {progress.best:.2f}"
+    return "; ".join(stages) + best
+
+
+def _train_grid(grid: "Grid", folder: Path, storage: str | None, workers: int) -> "pd.DataFrame":
+    """Train the runs of a grid that are missing, with a progress bar, and return the scores of all."""
+    from search import grid as grids
+    from search.storage import load_study, open_storage
+
+    where = storage or str(folder)
+    n_runs = len(grid.cells)
+    with ProgressBar(*ProgressBar.get_default_columns(), MofNCompleteColumn(), console=console) as bar:
+        task = bar.add_task(grid.name, total=n_runs)
+        for finished, failed in grids.run(grid, folder, where, workers):
+            bar.update(task, completed=finished, description=f"{grid.name}, {failed} failed" if failed else grid.name)
+    return grids.scores(load_study(open_storage(where, create=False), grid.name))
+
+
+def _show(frame: "pd.DataFrame", title: str) -> None:
+    """A table of numbers by name."""
+    table = Table(str(frame.index.name), *map(str, frame.columns), title=title)
+    table.columns[0].overflow = "fold"
+    for name, row in frame.iterrows():
+        cells = (str(int(value)) if column == "runs" else f"{value:.3f}" for column, value in row.items())
+        table.add_row(escape(str(name)), *cells)
+    console.print(table)
+
+
+@app.command()
+def baselines(config: SearchFile, storage: Storage = None, workers: Workers = 1, folder: Folder = None) -> None:
+    """Train the baselines of a search, which the evolution is compared with."""
+    with clear_errors():
+        from search import evolve
+        from search.config import load_config
+
+        settings = load_config(config)
+        if not settings.baselines:
+            raise ValueError(f"{config} names no baselines")
+        runs = _train_grid(evolve.baselines(settings), run_folder(config, folder), storage, workers)
+        means = runs.groupby("variant")["score"].agg(["mean", "std", "count"]).rename(columns={"count": "runs"})
+        _show(means.sort_values("mean", ascending=False), f"Baselines on {settings.environment}, AULC")
+
+
+@app.command("select-operator")
+def select_operator(config: SearchFile, storage: Storage = None, workers: Workers = 1, folder: Folder = None) -> None:
+    """Compare the ten operators on forward dynamics, as in the paper's table 2."""
+    with clear_errors():
+        from search import operator_selection
+        from search.config import load_config
+
+        settings = load_config(config)
+        runs = _train_grid(operator_selection.make_grid(settings), run_folder(config, folder), storage, workers)
+        _show(operator_selection.table(runs), "Normalized returns at the last checkpoint (paper, table 2)")
+
+
+@app.command("cross-validate")
+def cross_validate(
+    config: SearchFile,
+    study: Annotated[str | None, typer.Option(help="Study of the search. Default: the configuration file's name.")] = None,
+    top: Annotated[int | None, typer.Option(help="How many candidates. Default: the file's.", min=1)] = None,
+    storage: Storage = None,
+    workers: Workers = 1,
+    folder: Folder = None,
+) -> None:
+    """Train the best candidates of a search on several environments, and write the winner as YAML."""
+    with clear_errors():
+        from search import cross_validation
+        from search.config import load_config
+        from search.storage import load_study, open_storage
+
+        settings = load_config(config)
+        path = run_folder(config, folder)
+        searched = load_study(open_storage(storage or str(path), create=False), study or config.stem)
+        grid = cross_validation.make_grid(settings, searched, top)
+        runs = _train_grid(grid, path, storage, workers)
+        table = cross_validation.ranking(runs[runs["variant"].isin(grid.variants)])
+        _show(table, "Cross-validation, AULC")
+        winner = cross_validation.write_winner(table, path / "winner.yml")
+        console.print(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}", markup=False, soft_wrap=True, highlight=False)
+
+
+Run = Annotated[
+    Path | None,
+    typer.Argument(help="Folder of a search. Not needed with --storage, but pictures of notes lie there."),
+]
+
+
+@app.command()
+def dashboard(
+    folder: Run = None,
+    storage: Storage = None,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; the default is reached from this machine only.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.")] = 8080,
+) -> None:
+    """Watch a search in optuna-dashboard."""
+    with clear_errors():
+        from search.dashboard import serve
+        from search.evolve import ARTIFACTS
+        from search.storage import open_storage
+
+        opened = open_storage(storage or str(_need_folder(folder)), create=False)
+        console.print(f"http://{host}:{port}/  (Ctrl-C to stop)", highlight=False)
+        serve(opened, (folder or Path("runs")) / ARTIFACTS, host, port)
+
+
+@app.command()
+def report(
+    folder: Run = None,
+    storage: Storage = None,
+    study: Annotated[str | None, typer.Option(help="Name of the study. Default: the folder's name.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Configuration of the search, for settings and baselines.")] = None,
+    out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
+) -> None:
+    """Write a report of a search as one HTML file."""
+    with clear_errors():
+        from search import evolve
+        from search.config import load_config
+        from search.provenance import provenance
+        from search.report import write_report
+        from search.storage import load_study, open_storage
+
+        opened = open_storage(storage or str(_need_folder(folder)), create=False)
+        settings = None if config is None else load_config(config)
+        name = study or (None if folder is None else folder.name)
+        path = out or (folder or Path()) / "report.html"
+        lines = [] if settings is None else evolve.baseline_scores(settings, opened)
+        shown = None if settings is None else evolve.settings(settings)
+        write_report(load_study(opened, name), path, lines, shown, provenance())
+        console.print(f"Report: {path}", markup=False, soft_wrap=True, highlight=False)
+
+
+def _need_folder(folder: Path | None) -> Path:
+    if folder is None:
+        raise ValueError("name the folder of a search, or its --storage")
+    return folder
+
+
+def main() -> None:
+    """Run the program."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,452 @@
+"""Configurations of searches and hyper-parameters: plain YAML, read with a safe loader, checked before anything runs."""
+
+import contextlib
+import difflib
+import inspect
+import math
+import re
+import reprlib
+import types
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin
+
+import gymnasium as gym
+import yaml
+from stable_baselines3.sac.policies import SACPolicy
+
+from sb3_aarl import SACAux, catalog
+from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env, wrap_env
+from sb3_aarl.policies import SACAuxPolicy
+from search.sampler import AuxLossSampler
+
+# Values in a file, aliases written out.
+LARGEST = 100_000
+PRUNERS = ("none", "median", "hyperband")
+# What AuxLossSampler takes, under the same names.
+SAMPLER_KEYS = (
+    *("population_size", "n_random", "n_prior", "parents", "replacement", "crossover", "horizon_change", "random"),
+    *("max_horizon", "operators", "allow_duplicates", "screening", "seed"),
+)
+
+
+class ConfigError(ValueError):
+    """A configuration cannot be used; one line that names the file, the key and what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """
+    Cross-validation of a search's best candidates (paper, A.4).
+
+    :param environments: Ids of the environments
+    :param seeds: Seeds of the trainings on each
+    :param top: How many candidates
+    :param checkpoints: Environment steps of the evaluations, for environments that differ from the search's
+    """
+
+    environments: tuple[str, ...]
+    seeds: tuple[int, ...] = (0, 1, 2)
+    top: int = 5
+    checkpoints: dict[str, tuple[int, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class OperatorSelection:
+    """
+    Comparison of the ten operators (paper, A.1.3).
+
+    :param environments: Ids of the environments
+    :param seeds: Seeds of the trainings on each
+    """
+
+    environments: tuple[str, ...]
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """
+    A training that the candidates are compared with (the lines of the paper's figures 4 and 6).
+
+    :param name: Its name
+    :param aux_loss: Its auxiliary loss, None for none
+    :param overrides: Merged over the hyper-parameters of the search
+    """
+
+    name: str
+    aux_loss: AuxLoss | None = None
+    overrides: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """
+    A search. Defaults are the paper's.
+
+    :param path: The file that it was read from
+    :param environment: Id of the environment
+    :param hyperparameters: File of hyper-parameters, as :func:`load_hyperparameters` reads it
+    :param checkpoints: Environment steps of the evaluations, ascending; the last one ends the training
+    :param evaluation_episodes: Episodes of each evaluation
+    :param stages: Number of stages of the evolution
+    :param population_size: As in ``AuxLossSampler``, and so are the next ones up to ``seed``
+    :param n_random: As in ``AuxLossSampler``
+    :param n_prior: As in ``AuxLossSampler``
+    :param parents: As in ``AuxLossSampler``
+    :param replacement: As in ``AuxLossSampler``
+    :param crossover: As in ``AuxLossSampler``
+    :param horizon_change: As in ``AuxLossSampler``
+    :param random: As in ``AuxLossSampler``
+    :param max_horizon: As in ``AuxLossSampler``
+    :param operators: As in ``AuxLossSampler``
+    :param allow_duplicates: As in ``AuxLossSampler``
+    :param screening: As in ``AuxLossSampler``
+    :param seed: Seed of the evolution
+    :param seeds: Training seeds of every candidate, whose score is the mean over them
+    :param pruner: One of ``PRUNERS``
+    :param cross_validation: Cross-validation, None where the configuration has none
+    :param operator_selection: Operator selection, None where the configuration has none
+    :param baselines: What the candidates are compared with
+    :param overrides: Merged over the hyper-parameters of all trainings
+    """
+
+    path: Path
+    environment: str
+    hyperparameters: Path
+    checkpoints: tuple[int, ...]
+    evaluation_episodes: int = 10
+    stages: int = 7
+    population_size: int = 100
+    n_random: int = 100
+    n_prior: int = 25
+    parents: float = 0.25
+    replacement: float = 0.5
+    crossover: float = 0.2
+    horizon_change: float = 0.1
+    random: float = 0.2
+    max_horizon: int = 10
+    operators: tuple[str, ...] | None = None
+    allow_duplicates: bool = False
+    screening: int = 1
+    seed: int = 0
+    seeds: tuple[int, ...] = (0,)
+    pruner: str = "none"
+    cross_validation: CrossValidation | None = None
+    operator_selection: OperatorSelection | None = None
+    baselines: tuple[Baseline, ...] = ()
+    overrides: dict[str, Any] = field(default_factory=dict)
+
+    def hyperparameters_for(self, environment: str, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """
+        The hyper-parameters of a training.
+
+        :param environment: Id of the environment
+        :param overrides: Merged over them, such as those of a baseline
+        """
+        merged = merge(load_hyperparameters(self.hyperparameters, environment), self.overrides)
+        merged = merge(merged, overrides or {})
+        return _checked_hyperparameters(merged, environment, f"{self.path}: overrides")
+
+    def checkpoints_for(self, environment: str) -> tuple[int, ...]:
+        """
+        The environment steps of the evaluations on an environment.
+
+        :param environment: Id of the environment
+        """
+        others = self.cross_validation.checkpoints if self.cross_validation else {}
+        return self.checkpoints if environment == self.environment else others.get(environment, self.checkpoints)
+
+    def sampler_settings(self) -> dict[str, Any]:
+        """The arguments of ``AuxLossSampler``, the number of stages included."""
+        return {"n_stages": self.stages, **{name: getattr(self, name) for name in SAMPLER_KEYS}}
+
+
+def load_config(path: str | Path) -> SearchConfig:
+    """
+    Read a search's configuration, and check all that can be checked without training.
+
+    :param path: The YAML file
+    :raises ConfigError: naming the file and the key that is wrong
+    """
+    path = Path(path)
+    values = _read(path)
+    if "path" in values:
+        raise ConfigError(f"{path}: {_unknown('path', [item.name for item in fields(SearchConfig)][1:])}")
+    config: SearchConfig = _convert({"path": str(path.absolute()), **values}, SearchConfig, str(path), path.absolute().parent)
+    _check(config, str(path))
+    return config
+
+
+def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
+    """
+    Read the hyper-parameters of an environment from a file like RL-Zoo's: a mapping from environment id to arguments of
+    SACAux, ``policy``, ``n_timesteps`` (agent steps) and ``env_kwargs`` (of ``make_dmc_env``, or of ``wrap_env`` for
+    what is not DeepMind Control). The environment's own entry is merged over the entry ``default``.
+
+    Values are plain: nothing in the file is evaluated, schedules as text are refused.
+
+    :param path: The YAML file
+    :param env_id: Id of the environment
+    :raises ConfigError: naming the file and the key that is wrong
+    """
+    path = Path(path)
+    values = _read(path)
+    if not {"default", env_id} & values.keys():
+        raise ConfigError(f"{path}: neither {env_id!r} nor 'default' is there")
+    merged: dict[str, Any] = {}
+    for entry in ("default", env_id):
+        own = values.get(entry, {})
+        if not isinstance(own, dict):
+            raise ConfigError(f"{path}: {entry} must be a mapping, not {reprlib.repr(own)}")
+        merged = merge(merged, own)
+    return _checked_hyperparameters(merged, env_id, str(path))
+
+
+def resolve_env_id(name: str) -> str:
+    """
+    The id of an environment.
+
+    :param name: A registered id, or the short form of a DeepMind Control task, such as ``cheetah-run``
+    :raises ValueError: for an unknown one, with the nearest
+    """
+    full = f"{PREFIX}{name}-v0"
+    if full in env_ids():
+        return full
+    # Not gym.spec or gym.make, which import what stands before a colon.
+    if name in gym.registry:
+        return name
+    known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
+    nearest = difflib.get_close_matches(name, known, cutoff=0.4)
+    raise ValueError(f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}")
+
+
+def merge(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Merge a mapping over another one, and mappings in it likewise.
+
+    :param values: The mapping
+    :param others: What wins
+    """
+    merged = dict(values)
+    for key, value in others.items():
+        old = merged.get(key)
+        merged[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return merged
+
+
+class _Loader(yaml.SafeLoader):
+    """Also reads ``1e-3`` as a number, which is text in YAML 1.1, and refuses a key that is there twice."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.value != "<<")
+        for key, count in keys.items():
+            if count > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"{key!r} is there twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            values = yaml.load(file, _Loader)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except Exception as error:  # beside YAMLError, PyYAML lets through whatever goes wrong with a value: 2020-13-45, !!int ""
+        raise ConfigError(f"{path}: not YAML of plain values: {' '.join(str(error).split())}") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: must hold a mapping, not {reprlib.repr(values)}")
+    try:
+        size = _size(values, {})
+    except RecursionError:
+        size = math.inf
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    if size > LARGEST:
+        raise ConfigError(f"{path}: an alias refers to itself, or the file is too large with all of them written out")
+    return values
+
+
+def _size(value: Any, known: dict[int, float]) -> float:
+    """How many values there are if aliases are written out; refuses what is not plain."""
+    if value is None or isinstance(value, (str, int, float)):
+        return 1
+    if isinstance(value, dict):
+        for key in value:
+            if not isinstance(key, str):
+                raise ValueError(f"keys are text, {reprlib.repr(key)} is not")
+    elif not isinstance(value, list):
+        raise ValueError(f"{reprlib.repr(value)} is no plain value, but a {type(value).__name__}")
+    if id(value) not in known:
+        known[id(value)] = math.inf  # as long as we are inside of it
+        known[id(value)] = 1 + sum(_size(item, known) for item in (value.values() if isinstance(value, dict) else value))
+    return known[id(value)]
+
+
+def _unknown(key: str, known: Iterable[str]) -> str:
+    return f"unknown key {key!r}, nearest known key: {difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]!r}"
+
+
+def _mapping(values: Any, hints: Mapping[str, Any], where: str, folder: Path) -> dict[str, Any]:
+    """A mapping whose keys are known and whose values are of the types that go with them."""
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where} must be a mapping, not {reprlib.repr(values)}")
+    for key in values:
+        if key not in hints:
+            raise ConfigError(f"{where}: {_unknown(key, list(hints))}")
+    separator = "." if ": " in where else ": "  # a file comes first
+    return {key: _convert(value, hints[key], f"{where}{separator}{key}", folder) for key, value in values.items()}
+
+
+def _convert(value: Any, hint: Any, where: str, folder: Path) -> Any:
+    """A plain value as the type that it is annotated with."""
+    kind, arguments = get_origin(hint), get_args(hint)
+    if is_dataclass(hint) and hint is not AuxLoss:
+        known = {item.name: item for item in fields(hint)}
+        converted = _mapping(value, {name: item.type for name, item in known.items()}, where, folder)
+        for name, item in known.items():
+            if name not in converted and item.default is MISSING and item.default_factory is MISSING:
+                raise ConfigError(f"{where}: {name} is missing")
+        assert isinstance(hint, type)
+        return hint(**converted)
+    if kind in (Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        nested = [argument for argument in arguments if argument is AuxLoss or is_dataclass(argument)]
+        for argument in nested or arguments:
+            if nested:
+                return _convert(value, argument, where, folder)
+            with contextlib.suppress(ConfigError):
+                return _convert(value, argument, where, folder)
+    elif hint is AuxLoss:
+        try:
+            return None if value == "none" else catalog.resolve(value)
+        except ValueError as error:
+            raise ConfigError(f"{where}: {error}") from None
+    elif hint is Path and isinstance(value, str):
+        return folder / value
+    elif hint is Any or (hint in (str, bool) and isinstance(value, hint)):
+        return value
+    elif hint in (int, float) and isinstance(value, (int, float)) and not isinstance(value, bool):
+        # 1e5 is a float to YAML; compared, not converted first: an int may be too large for a float.
+        if abs(value) < 1e300 and (hint is float or value == int(value)):
+            return hint(value)
+    elif kind is tuple and isinstance(value, (list, tuple)):
+        types_of = [arguments[0]] * len(value) if arguments[1:] == (...,) else list(arguments)
+        if len(types_of) == len(value):
+            return tuple(_convert(*pair, f"{where}[{i}]", folder) for i, pair in enumerate(zip(value, types_of, strict=True)))
+    elif kind is list and isinstance(value, (list, tuple)):
+        return [_convert(item, arguments[0], f"{where}[{i}]", folder) for i, item in enumerate(value)]
+    elif (kind or hint) in (dict, Mapping) and isinstance(value, dict):
+        return {key: _convert(item, (*arguments, Any, Any)[1], f"{where}.{key}", folder) for key, item in value.items()}
+    raise ConfigError(f"{where} must be {_describe(hint)}, not {reprlib.repr(value)}")
+
+
+def _describe(hint: Any) -> str:
+    names = {int: "an integer", float: "a number", str: "text", bool: "true or false", type(None): "null", Path: "a path"}
+    if get_origin(hint) in (Union, types.UnionType):
+        return " or ".join(dict.fromkeys(_describe(argument) for argument in get_args(hint) if _is_plain(argument)))
+    if get_origin(hint) in (tuple, list):
+        return f"a list of {' and '.join(_describe(item) for item in get_args(hint) if item is not ...)}"
+    return names.get(hint, "a mapping")
+
+
+def _is_plain(hint: Any) -> bool:
+    """Whether YAML can say it: no objects, no functions."""
+    return (get_origin(hint) or hint) in (int, float, str, bool, type(None), tuple, list, dict, Mapping)
+
+
+def _arguments(*functions: Callable[..., Any], without: Iterable[str]) -> dict[str, Any]:
+    """The arguments of functions, with their annotations."""
+    parameters = (parameter for function in functions for parameter in inspect.signature(function).parameters.values())
+    return {
+        parameter.name: parameter.annotation
+        for parameter in parameters
+        if parameter.name not in without and parameter.kind != inspect.Parameter.VAR_KEYWORD
+    }
+
+
+_POLICY_ARGUMENTS = _arguments(
+    SACPolicy,
+    SACAuxPolicy,
+    without=("observation_space", "action_space", "lr_schedule", "use_sde", "augmentation", "crop_size"),
+)
+_ARGUMENTS = {
+    **_arguments(SACAux, without=("env", "seed", "action_noise", "replay_buffer_class", "_init_setup_model")),
+    "policy": str,
+    "n_timesteps": int,
+    "env_kwargs": dict,
+}
+
+
+def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str) -> dict[str, Any]:
+    checked = _mapping(dict(values), _ARGUMENTS, where, Path())
+    make = make_dmc_env if env_id.startswith(PREFIX) else wrap_env
+    for key, hints in (
+        ("env_kwargs", _arguments(make, without=("env_id", "env", "seed"))),
+        ("policy_kwargs", _POLICY_ARGUMENTS),
+    ):
+        if checked.get(key) is not None:
+            checked[key] = _mapping(checked[key], hints, f"{where}: {key}", Path())
+    if checked.get("aux_loss") not in (None, "auto"):
+        _convert(values["aux_loss"], AuxLoss, f"{where}: aux_loss", Path())
+        checked["aux_loss"] = None if values["aux_loss"] == "none" else values["aux_loss"]
+    return checked
+
+
+def _check(config: SearchConfig, where: str) -> None:
+    """What a whole search would stumble on after hours."""
+
+    def check(holds: bool, problem: str) -> None:
+        if not holds:
+            raise ConfigError(f"{where}: {problem}")
+
+    check(config.pruner in PRUNERS, f"pruner must be one of {', '.join(PRUNERS)}, not {config.pruner!r}")
+    check(config.evaluation_episodes > 0, f"evaluation_episodes must be at least 1, not {config.evaluation_episodes}")
+    try:
+        AuxLossSampler(**config.sampler_settings())
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    parts: dict[str, CrossValidation | OperatorSelection | None] = {
+        "cross_validation": config.cross_validation,
+        "operator_selection": config.operator_selection,
+    }
+    check(config.cross_validation is None or config.cross_validation.top > 0, "cross_validation.top must be at least 1")
+    seeds = {"seeds": config.seeds} | {f"{name}.seeds": part.seeds for name, part in parts.items() if part}
+    for name, numbers in seeds.items():
+        good = len(set(numbers)) == len(numbers) > 0 and min(numbers) >= 0
+        check(good, f"{name} must be different numbers that are not negative, not {list(numbers)}")
+    names = [baseline.name for baseline in config.baselines]
+    check(len(set(names)) == len(names), f"two baselines have one name: {', '.join(names)}")
+
+    environments: dict[str, tuple[str, ...]] = {"environment": (config.environment,)}
+    environments |= {f"{name}.environments": part.environments for name, part in parts.items() if part}
+    if config.cross_validation:
+        environments["cross_validation.checkpoints"] = tuple(config.cross_validation.checkpoints)
+    for key, env_ids_ in environments.items():
+        check(bool(env_ids_) or key.endswith("checkpoints"), f"{key} must name at least one environment")
+        for env_id in env_ids_:
+            try:
+                full = resolve_env_id(env_id)
+            except ValueError as error:
+                raise ConfigError(f"{where}: {key}: {error}") from None
+            check(full == env_id, f"{key}: write {full!r} for {env_id!r}")
+            baselines = config.baselines if env_id == config.environment else ()
+            for overrides in ({}, *(baseline.overrides for baseline in baselines)):
+                settings = config.hyperparameters_for(env_id, overrides)
+                repeat = settings.get("env_kwargs", {}).get("action_repeat", 1)
+                check(repeat > 0, f"action_repeat must be at least 1, not {repeat}")
+                steps = list(config.checkpoints_for(env_id))
+                ascending = bool(steps) and sorted(set(steps)) == steps and steps[0] > 0
+                check(ascending, f"checkpoints must be positive environment steps in ascending order, not {steps} ({env_id})")
+                between = [step for step in steps if step % repeat]
+                check(not between, f"checkpoints must be multiples of {env_id}'s action repeat {repeat}, {between} are not")

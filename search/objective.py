@@ -1,0 +1,172 @@
+"""The objective of a search: train one candidate, report its learning curve, return the area under it (AULC)."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import torch as th
+from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
+
+from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.callbacks import Evaluation
+from search.config import SearchConfig
+from search.provenance import commit
+from search.space import suggest_aux_loss
+from search.training import TrainingError, train_candidate
+
+
+class CandidateFailed(RuntimeError):
+    """A candidate could not be trained; the trial fails with the user attribute ``reason``, the study goes on."""
+
+
+class Objective:
+    """
+    Trains the candidate that a trial proposes, and returns the mean AULC over the training seeds: to be maximized.
+
+    Each evaluation is reported at its environment steps, and the trial is pruned if its pruner says so. With several
+    seeds it is the curve of the first one that is reported: trials are compared like with like, and a pruned one is
+    spared its other seeds.
+
+    User attributes of a trial: ``loss`` (notation), ``canonical``, ``environment``, ``commit``; ``curve`` (a list of
+    [environment steps, mean, standard deviation] over the episodes of all seeds) and ``seconds`` of training when it
+    ends; ``reason`` when it fails; ``interrupted`` when Ctrl-C stopped it.
+
+    ``study.optimize(objective, catch=CandidateFailed)`` goes on after a candidate that failed.
+
+    :param config: The search
+    :param folder: Folder of the study; every candidate has one of its own in it, with its learning curves
+    :param threads: Threads of PyTorch in this process, None to leave them as they are
+    """
+
+    def __init__(self, config: SearchConfig, folder: str | Path, threads: int | None = None):
+        self.config = config
+        self.folder = Path(folder)
+        self.threads = threads
+        self.commit = commit()
+
+    def __call__(self, trial: optuna.Trial) -> float:
+        """
+        :param trial: Proposes the candidate
+        :return: Mean AULC over the seeds
+        :raises optuna.TrialPruned: for an invalid candidate, before anything is trained, and for a pruned one
+        :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
+        """
+        loss = suggest_aux_loss(trial, self.config.max_horizon, self.config.operators)
+        return self.train(trial, loss, self.config.environment, self.config.seeds)
+
+    def train(
+        self,
+        trial: optuna.Trial,
+        aux_loss: AuxLoss | None,
+        environment: str,
+        seeds: Sequence[int],
+        overrides: Mapping[str, Any] | None = None,
+    ) -> float:
+        """
+        Train a given loss for a trial, for procedures that do not search.
+
+        :param trial: Gets the reports and the user attributes
+        :param aux_loss: The loss, None for none
+        :param environment: Id of the environment
+        :param seeds: Training seeds
+        :param overrides: Merged over the hyper-parameters of the configuration
+        :return: Mean AULC over the seeds
+        :raises optuna.TrialPruned: when the pruner says so
+        :raises CandidateFailed: as above
+        """
+        config = self.config
+        hyperparameters = config.hyperparameters_for(environment, overrides)
+        checkpoints = config.checkpoints_for(environment)
+        folder = self.folder / _folder_name(trial, aux_loss, environment, seeds)
+        attributes = {
+            "loss": "none" if aux_loss is None else str(aux_loss),
+            "canonical": "none" if aux_loss is None else str(aux_loss.canonical()),
+            "environment": environment,
+            "commit": self.commit,
+        }
+        for key, value in attributes.items():
+            trial.set_user_attr(key, value)
+
+        curves: list[list[Evaluation]] = []
+        pruned = False
+
+        def report(evaluation: Evaluation) -> bool:
+            nonlocal pruned
+            if not curves:
+                trial.report(evaluation.mean, evaluation.environment_steps)
+                # After the last evaluation nothing is left to spare.
+                pruned = evaluation.environment_steps != checkpoints[-1] and trial.should_prune()
+            return not pruned
+
+        scores = []
+        try:
+            for seed in seeds:
+                run = train_candidate(
+                    environment,
+                    aux_loss,
+                    hyperparameters,
+                    seed,
+                    checkpoints,
+                    config.evaluation_episodes,
+                    folder / f"seed-{seed}",
+                    on_evaluation=report,
+                    threads=self.threads,
+                )
+                curves.append(run.curve)
+                scores.append(run.aulc)
+                if pruned:
+                    break
+        except (TrainingError, MemoryError, th.cuda.OutOfMemoryError) as error:
+            reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
+            trial.set_user_attr("reason", reason)
+            raise CandidateFailed(reason) from error
+        except KeyboardInterrupt:
+            trial.set_user_attr("interrupted", True)
+            raise
+        trial.set_user_attr("curve", mean_curve(curves))
+        trial.set_user_attr("seconds", round(sum(curve[-1].seconds for curve in curves), 1))
+        if pruned:
+            raise optuna.TrialPruned(f"pruned after {curves[0][-1].environment_steps} environment steps")
+        return float(np.mean(scores))
+
+
+def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
+    """
+    The learning curve over several seeds.
+
+    :param curves: One for each seed, of equal length and with equally many episodes
+    :return: [environment steps, mean, standard deviation] over the episodes of all seeds, for every evaluation
+    """
+    points = []
+    for evaluations in zip(*curves, strict=True):
+        means, deviations = np.array([(evaluation.mean, evaluation.std) for evaluation in evaluations]).T
+        # The variance of all episodes: within the seeds, and between them.
+        points.append(
+            [evaluations[0].environment_steps, float(means.mean()), float(np.sqrt((deviations**2).mean() + means.var()))]
+        )
+    return points
+
+
+def make_pruner(config: SearchConfig) -> BasePruner:
+    """
+    Optuna's pruner of a configuration.
+
+    :param config: The search
+    """
+    if config.pruner == "median":
+        return MedianPruner()
+    if config.pruner == "hyperband":
+        return HyperbandPruner(min_resource=config.checkpoints[0], max_resource=config.checkpoints[-1])
+    return NopPruner()
+
+
+def _folder_name(trial: optuna.Trial, aux_loss: AuxLoss | None, environment: str, seeds: Sequence[int]) -> str:
+    """The same for a trial that takes up what another one, killed, had begun: same place, loss, environment and seeds."""
+    digest = hashlib.sha256(f"{aux_loss} {environment} {list(seeds)}".encode()).hexdigest()[:12]
+    # From the storage: a Trial shows its user attributes as they were before the sampler gave it a place.
+    attributes = trial.study._storage.get_trial(trial._trial_id).user_attrs
+    stage, place = attributes.get("stage"), attributes.get("place")
+    return digest if stage is None else f"stage-{stage}-place-{place}-{digest}"

@@ -1,0 +1,347 @@
+"""Train one candidate: environment, model, learning curve, and checkpoints from which a killed training goes on."""
+
+import hashlib
+import json
+import logging
+import re
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_aarl import SACAux, catalog
+from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, aulc, read_curve, write_curve
+from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
+from search.config import load_hyperparameters, resolve_env_id
+
+logger = logging.getLogger(__name__)
+
+# Far from the training seeds: evaluations do not begin where trainings did.
+EVALUATION_SEED = 10_000
+
+
+class TrainingError(RuntimeError):
+    """A training failed while it ran; the message is the reason in one line."""
+
+
+class TrainingRun(NamedTuple):
+    """
+    What a training gave.
+
+    :param curve: Its learning curve
+    :param aulc: Area under it
+    """
+
+    curve: list[Evaluation]
+    aulc: float
+
+
+def make_env(env_id: str, env_kwargs: Mapping[str, Any], seed: int | None = None) -> gym.Env:
+    """
+    An environment of a configuration.
+
+    :param env_id: Id of a DeepMind Control task, or of any other Gymnasium environment
+    :param env_kwargs: Arguments of ``make_dmc_env``, or of ``wrap_env``
+    :param seed: Seed of ``make_dmc_env``; other environments take the one of ``reset``
+    """
+    if env_id.startswith(PREFIX):
+        return make_dmc_env(env_id, **env_kwargs, seed=seed)
+    return wrap_env(gym.make(env_id, render_mode="rgb_array" if env_kwargs.get("pixels") else None), **env_kwargs)
+
+
+def spread_checkpoints(environment_steps: int, n_evaluations: int, action_repeat: int = 1) -> tuple[int, ...]:
+    """
+    Equally spaced checkpoints, each a multiple of the action repeat; the last is at most an interval early.
+
+    :param environment_steps: Environment steps of the training
+    :param n_evaluations: Number of checkpoints
+    :param action_repeat: Environment steps of one agent step
+    :raises ValueError: when there are fewer agent steps than checkpoints
+    """
+    if n_evaluations < 1 or environment_steps < n_evaluations * action_repeat:
+        raise ValueError(
+            f"{environment_steps} environment steps at an action repeat of {action_repeat} are too few for "
+            f"{n_evaluations} evaluations"
+        )
+    every = environment_steps // n_evaluations // action_repeat * action_repeat
+    return tuple(every * (i + 1) for i in range(n_evaluations))
+
+
+def train_candidate(
+    environment: str,
+    aux_loss: AuxLoss | str | None,
+    hyperparameters: Mapping[str, Any],
+    seed: int,
+    checkpoints: Sequence[int],
+    evaluation_episodes: int = 10,
+    folder: str | Path | None = None,
+    on_evaluation: Callable[[Evaluation], bool | None] | None = None,
+    threads: int | None = None,
+    keep_model: bool = False,
+    progress_bar: bool = False,
+) -> TrainingRun:
+    """
+    Train SACAux with an auxiliary loss up to the last checkpoint, and evaluate it at each.
+
+    With a folder, a training that was killed goes on from its last evaluation: model, optimizers, replay buffer and
+    random generators are as they were. The state of the simulation is not saved: the episode that ran is cut off there
+    (the buffer takes it for truncated) and a new one begins, so the rest differs from that of a run that was not
+    killed. A checkpoint that is torn, or of other settings, is refused, and the training begins anew. When it is over,
+    for whatever reason but an interruption, the checkpoint is removed and ``curve.csv`` stays; a training whose curve
+    is complete is not repeated.
+
+    :param environment: Id of the environment
+    :param aux_loss: The auxiliary loss as SACAux takes it
+    :param hyperparameters: As ``load_hyperparameters`` gives them
+    :param seed: Seed of the training
+    :param checkpoints: Environment steps of the evaluations, ascending
+    :param evaluation_episodes: Episodes of each evaluation
+    :param folder: Where checkpoint and curve are kept, None to keep nothing. One training at a time in a folder
+    :param on_evaluation: Called after every evaluation, and after those of a run that goes on again. Training ends early
+        if it returns False
+    :param threads: Threads of PyTorch in this process, None to leave them as they are
+    :param keep_model: Whether to leave the trained model as ``model.zip`` in the folder
+    :param progress_bar: Whether to show a progress bar
+    :raises TrainingError: when the training fails while it runs, the cause being its ``__cause__``
+    :raises FileExistsError: when the folder has the model of another training
+    :raises ValueError: when environment or model cannot be made of these settings
+    """
+    if threads is not None:
+        th.set_num_threads(threads)
+    settings = dict(hyperparameters)
+    settings.pop("n_timesteps", None)
+    env_kwargs = settings.pop("env_kwargs", None) or {}
+    policy = settings.pop("policy", "CnnPolicy" if env_kwargs.get("pixels") else "MlpPolicy")
+    agent_steps = checkpoints[-1] // env_kwargs.get("action_repeat", 1)
+    if "buffer_size" in settings:
+        settings["buffer_size"] = min(settings["buffer_size"], agent_steps)  # the same run, with smaller checkpoints
+    settings |= {"aux_loss": aux_loss, "seed": seed}
+
+    store, curve = None, None
+    if folder is not None:
+        asked_for = [environment, policy, env_kwargs, settings, list(checkpoints), evaluation_episodes]
+        store = _RunFolder(Path(folder), str(aux_loss), seed, asked_for)
+        curve = store.finished_curve(checkpoints, keep_model)
+    if curve is None:
+        env = make_env(environment, env_kwargs, seed)
+        eval_env = make_env(environment, env_kwargs)
+        try:
+            model, curve = store.load(env, settings.get("device", "auto")) if store is not None else (None, [])
+            if _repeat(curve, on_evaluation):
+                model = model or SACAux(policy, env, **settings)
+                curve_callback = LearningCurveCallback(
+                    eval_env,
+                    checkpoints,
+                    evaluation_episodes,
+                    seed=EVALUATION_SEED + seed,
+                    path=None if store is None else store.curve_path,
+                    on_evaluation=on_evaluation,
+                    curve=curve,
+                )
+                curve = curve_callback.curve
+                saving = [] if store is None else [_CheckpointCallback(store, curve)]
+                _learn(model, agent_steps, [curve_callback, *saving], progress_bar)
+                if store is not None and keep_model:
+                    store.save_model(model)
+        except Exception:
+            # Not after an interruption, which is no Exception.
+            if store is not None:
+                store.remove_checkpoint()
+            raise
+        finally:
+            env.close()
+            eval_env.close()
+    else:
+        _repeat(curve, on_evaluation)
+    if store is not None:
+        store.remove_checkpoint()
+    return TrainingRun(curve, aulc(curve))
+
+
+def train_and_keep(
+    environment: str,
+    aux_loss: str | None,
+    config: str | Path,
+    environment_steps: int | None = None,
+    n_evaluations: int = 5,
+    evaluation_episodes: int = 10,
+    seed: int = 0,
+    folder: str | Path | None = None,
+) -> tuple[TrainingRun, Path]:
+    """
+    Train with one loss and keep the model, with a progress bar.
+
+    :param environment: Id of the environment, or the short form of a DeepMind Control task
+    :param aux_loss: Notation or name, ``"none"`` for none; None for what the file of hyper-parameters says, or ``"auto"``
+    :param config: File of hyper-parameters
+    :param environment_steps: Environment steps of the training, None for the file's ``n_timesteps``
+    :param n_evaluations: Number of evaluations
+    :param evaluation_episodes: Episodes of each
+    :param seed: Seed of the training
+    :param folder: Where model and curve are kept, None for a folder in ``runs`` named after environment, loss and seed
+    :return: The training, and its folder
+    :raises ValueError: when something is unknown or does not fit
+    :raises TrainingError: when the training fails while it runs
+    """
+    environment = resolve_env_id(environment)
+    hyperparameters = load_hyperparameters(config, environment)
+    loss = hyperparameters.get("aux_loss", "auto") if aux_loss is None else aux_loss
+    loss = None if loss in (None, "none") else loss if loss == "auto" else catalog.resolve(loss)
+    action_repeat = hyperparameters.get("env_kwargs", {}).get("action_repeat", 1)
+    if environment_steps is None:
+        if "n_timesteps" not in hyperparameters:
+            raise ValueError(f"how many steps? {config} has no n_timesteps for {environment}")
+        environment_steps = hyperparameters["n_timesteps"] * action_repeat
+    checkpoints = spread_checkpoints(environment_steps, n_evaluations, action_repeat)
+    if folder is None:
+        # A notation may be longer than a file's name may be.
+        label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {aux_loss or 'auto'}".lower())[:80].strip("-")
+        settings = f"{loss} {hyperparameters} {checkpoints} {evaluation_episodes}"
+        folder = Path("runs") / f"{label}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}-seed-{seed}"
+    run = train_candidate(
+        environment,
+        loss,
+        hyperparameters,
+        seed,
+        checkpoints,
+        evaluation_episodes,
+        folder,
+        keep_model=True,
+        progress_bar=True,
+    )
+    return run, Path(folder)
+
+
+def _repeat(curve: Sequence[Evaluation], on_evaluation: Callable[[Evaluation], bool | None] | None) -> bool:
+    """Tell of the evaluations of a run that goes on; False if training is to end."""
+    return on_evaluation is None or all(on_evaluation(evaluation) is not False for evaluation in curve)
+
+
+def _learn(model: SACAux, agent_steps: int, callbacks: list[BaseCallback], progress_bar: bool) -> None:
+    """Train up to a number of agent steps; whatever goes wrong is the candidate's failure."""
+    try:
+        remaining = agent_steps - model.num_timesteps
+        model.learn(remaining, callbacks, log_interval=10**9, reset_num_timesteps=False, progress_bar=progress_bar)
+    except Exception as error:
+        raise TrainingError(" ".join(f"{type(error).__name__}: {error}".split())) from error
+
+
+class _RunFolder:
+    """
+    What a training leaves: ``run.json`` (what was trained), ``curve.csv``, and, while it runs, the last checkpoint.
+
+    :param folder: The folder
+    :param loss: Notation of the loss, for people
+    :param seed: Seed of the training
+    :param settings: All that decides what comes out
+    """
+
+    def __init__(self, folder: Path, loss: str, seed: int, settings: Any):
+        digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
+        self.description = {"loss": loss, "seed": seed, "settings": digest}
+        self.folder = folder
+        self.seed = seed
+        self.curve_path = folder / "curve.csv"
+        self.model_path = folder / "model.zip"
+        self._checkpoints = folder / "checkpoint"
+
+    def finished_curve(self, checkpoints: Sequence[int], with_model: bool) -> list[Evaluation] | None:
+        """The curve if this very training was finished before."""
+        if not _holds(self.folder, self.description) or (with_model and not self.model_path.exists()):
+            return None
+        try:
+            curve = read_curve(self.curve_path)
+        except (OSError, ValueError):
+            return None
+        return curve if [evaluation.environment_steps for evaluation in curve] == list(checkpoints) else None
+
+    def load(self, env: gym.Env, device: str) -> tuple[SACAux | None, list[Evaluation]]:
+        """The last checkpoint: model with replay buffer, and its curve; without one, the folder begins anew."""
+        saved = [path for path in self._checkpoints.glob("*") if path.name.isdecimal()]
+        if saved:
+            newest = max(saved, key=lambda path: int(path.name))
+            try:
+                if not _holds(newest, self.description):
+                    raise ValueError("it belongs to a training with other settings")
+                curve = read_curve(newest / "curve.csv")
+                model = SACAux.load(newest / "model.zip", env, device=device)
+                model.load_replay_buffer(newest / "replay_buffer.pkl")
+            except Exception as error:  # what a torn file does to zipfile, pickle and torch
+                logger.warning("The checkpoint %s is of no use, training begins anew: %s", newest, error)
+            else:
+                # Not the initial states of the beginning again.
+                vec_env = model.get_env()
+                assert vec_env is not None
+                vec_env.seed(self.seed + model.num_timesteps)
+                logger.info("Training goes on after %d environment steps", curve[-1].environment_steps)
+                return model, curve
+        self.remove_checkpoint()
+        if self.model_path.exists():
+            raise FileExistsError(f"{self.folder} has the model of another training: choose another folder")
+        self.curve_path.unlink(missing_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._describe(self.folder)
+        return None, []
+
+    def save(self, model: SACAux, curve: Sequence[Evaluation]) -> None:
+        """Put a checkpoint in the place of the one before, in one step."""
+        unfinished = self._checkpoints / "unfinished"
+        unfinished.mkdir(parents=True, exist_ok=True)
+        model.save(unfinished / "model.zip")
+        model.save_replay_buffer(unfinished / "replay_buffer.pkl")
+        write_curve(unfinished / "curve.csv", curve)
+        self._describe(unfinished)
+        checkpoint = unfinished.rename(self._checkpoints / str(curve[-1].environment_steps))
+        for path in self._checkpoints.glob("*"):
+            if path != checkpoint:
+                shutil.rmtree(path)
+
+    def save_model(self, model: SACAux) -> None:
+        """Leave the trained model in the folder."""
+        unfinished = self.folder / "unfinished.zip"
+        model.save(unfinished)
+        unfinished.replace(self.model_path)
+
+    def remove_checkpoint(self) -> None:
+        """Replay buffers are large."""
+        shutil.rmtree(self._checkpoints, ignore_errors=True)
+
+    def _describe(self, folder: Path) -> None:
+        (folder / "run.json").write_text(json.dumps(self.description, indent=1) + "\n", encoding="utf-8")
+
+
+def _holds(folder: Path, description: Mapping[str, Any]) -> bool:
+    """Whether a folder is that of a training."""
+    try:
+        return json.loads((folder / "run.json").read_text(encoding="utf-8")) == description
+    except (OSError, ValueError):
+        return False
+
+
+class _CheckpointCallback(BaseCallback):
+    """
+    Saves a checkpoint after every evaluation: when the agent step that was evaluated is stored and trained on.
+
+    :param store: Where
+    :param curve: The learning curve, which the other callback appends to
+    """
+
+    def __init__(self, store: _RunFolder, curve: list[Evaluation]):
+        super().__init__()
+        self.store = store
+        self.curve = curve
+        self._n_saved = len(curve)
+
+    def _on_rollout_start(self) -> None:
+        if len(self.curve) > self._n_saved:
+            assert isinstance(self.model, SACAux)
+            self.store.save(self.model, self.curve)
+            self._n_saved = len(self.curve)
+
+    def _on_step(self) -> bool:
+        return True
