@@ -149,7 +149,8 @@ def _row(trial: FrozenTrial) -> dict[str, Any]:
 
 def _plots(figures: Sequence[go.Figure]) -> list[Markup]:
     """The plots as HTML; the first of them brings plotly.js along."""
-    config = {"displaylogo": False, "responsive": True}
+    # Without the button that would send the data to plotly's cloud.
+    config = {"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["sendChartToCloud"]}
     return [
         Markup(to_html(figure, config=config, include_plotlyjs=position == 0, full_html=False, default_height="520px"))
         for position, figure in enumerate(figures)

@@ -194,6 +194,8 @@ def test_in_a_real_browser(study, tmp_path):
         with_curve = [trial for trial in best[:5] if "curve" in trial.user_attrs]
         assert with_curve and all(f"trial {trial.number}" in curves.text for trial in with_curve)
         wait.until(lambda _: points(curves) == 2)
+        buttons = [button.get_attribute("data-title") for button in browser.find_elements(By.CLASS_NAME, "modebar-btn")]
+        assert "Zoom in" in buttons and not any("share" in title.lower() for title in buttons if title)
         # Typeset: a subscript is set lower and smaller than what it belongs to.
         base, subscript = browser.find_element(By.CSS_SELECTOR, ".winner msub").find_elements(By.XPATH, "./*")
         bottom = {part: part.rect["y"] + part.rect["height"] for part in (base, subscript)}
