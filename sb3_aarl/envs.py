@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import difflib
+import logging
 import os
 import sys
 from typing import Any
@@ -42,6 +43,9 @@ with contextlib.suppress(ImportError):
 with contextlib.redirect_stdout(None):
     import shimmy  # noqa: F401  (registers dm_control/...)
 from dm_control import suite  # noqa: E402
+
+# dm_control's models use what MuJoCo calls deprecated, and it says so each time that one is made.
+logging.getLogger("absl").addFilter(lambda record: "settotalmass" not in record.getMessage())
 
 PREFIX = "dm_control/"
 # Simulator steps of an episode; only LQR has no time limit of its own.

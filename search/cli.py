@@ -36,13 +36,12 @@ def program() -> None:
 @contextlib.contextmanager
 def clear_errors() -> Iterator[None]:
     """What a user can mend is one line and exit code 2, not a traceback; Ctrl-C is exit code 130."""
+    from search.pool import WorkerError
     from search.training import TrainingError
 
-    # dm_control's models use what MuJoCo calls deprecated, and it says so every time that one is made.
-    logging.getLogger("absl").setLevel(logging.ERROR)
     try:
         yield
-    except (ValueError, OSError, TrainingError) as error:
+    except (ValueError, OSError, TrainingError, WorkerError) as error:
         errors.print(f"Error: {' '.join(str(error).split())}", style="red", markup=False, highlight=False)
         raise typer.Exit(2) from None
     except KeyboardInterrupt:

@@ -2,25 +2,31 @@
 
 import time
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import optuna
+from optuna.artifacts import FileSystemArtifactStore
 from optuna.trial import FrozenTrial, TrialState
 
-from search import workers
+from search import grid, workers
 from search.config import SearchConfig
 from search.dashboard import annotate_study, annotate_trial, update_plots
-from search.objective import CandidateFailed, Objective
+from search.objective import CandidateFailed, Objective, make_pruner
 from search.pool import WorkerPool
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
 from search.storage import open_storage
+from search.trials import loss_of, ranked
 
 # Candidates that may fail one after the other in one worker: then it is not the losses that are at fault.
 MAX_FAILURES = 10
 # Seconds between two looks at the storage, by a worker without a place and by the live table.
 POLL_SECONDS = 1.0
+# Seconds between two drawings of the evolution: each stays in the storage, a hundred kilobytes for a whole search.
+PLOT_SECONDS = 300.0
+ARTIFACTS = "artifacts"  # folder of the pictures in notes
 
 
 class Progress(NamedTuple):
@@ -37,69 +43,62 @@ class Progress(NamedTuple):
     seconds_to_go: float | None
 
 
-def make_sampler(config: SearchConfig, stages: int | None = None, worker: str | None = None) -> AuxLossSampler:
+def study_name(config: SearchConfig) -> str:
+    """The name of a search's study: that of its file."""
+    return config.path.stem
+
+
+def settings(config: SearchConfig) -> dict[str, Any]:
+    """What a note or a report says of the settings: the hyper-parameters written out, in plain values."""
+    hidden = ("path", "overrides", "hyperparameters", "cross_validation", "operator_selection", "baselines")
+    shown = {item.name: getattr(config, item.name) for item in fields(config) if item.name not in hidden}
+    return {**shown, **config.hyperparameters_for(config.environment)}
+
+
+def baselines(config: SearchConfig) -> grid.Grid:
     """
-    The sampler of a search.
+    The trainings that candidates are compared with, on the search's environment and seeds.
 
-    :param config: Settings of the search
-    :param stages: Number of stages instead of the config's
-    :param worker: As in AuxLossSampler
+    :param config: The search
     """
-    return AuxLossSampler(
-        population_size=config.population_size,
-        n_random=config.n_random,
-        n_prior=config.n_prior,
-        parents=config.parents,
-        replacement=config.replacement,
-        crossover=config.crossover,
-        horizon_change=config.horizon_change,
-        random=config.random,
-        max_horizon=config.max_horizon,
-        operators=config.operators,
-        allow_duplicates=config.allow_duplicates,
-        seed=config.seed,
-        screening=config.screening,
-        n_stages=config.stages if stages is None else stages,
-        worker=worker,
-    )
+    variants = {baseline.name: grid.Variant(baseline.aux_loss, baseline.overrides) for baseline in config.baselines}
+    return grid.Grid(f"{study_name(config)}-baselines", config, variants, [config.environment], config.seeds)
 
 
-def make_pruner(name: str, config: SearchConfig) -> optuna.pruners.BasePruner:
+def baseline_scores(config: SearchConfig, storage: optuna.storages.BaseStorage) -> list[tuple[str, float]]:
     """
-    :param name: ``none``, ``median`` or ``hyperband``
-    :param config: Settings of the search; pruners need its checkpoints
+    Name and mean score of the baselines that are trained.
+
+    :param config: The search
+    :param storage: Its storage
     """
-    if name == "median":
-        return optuna.pruners.MedianPruner(n_startup_trials=config.n_random + config.n_prior)
-    if name == "hyperband":
-        return optuna.pruners.HyperbandPruner(min_resource=config.checkpoints[0], max_resource=config.checkpoints[-1])
-    return optuna.pruners.NopPruner()
+    name = baselines(config).name
+    if name not in optuna.get_all_study_names(storage):
+        return []
+    scores = grid.scores(optuna.load_study(study_name=name, storage=storage))
+    return [(str(name), float(score)) for name, score in scores.groupby("variant")["score"].mean().items()]
 
 
-def run_worker(config: SearchConfig, folder: Path, where: str, stages: int | None, pruner: str | None) -> None:
+def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
     """
     Train candidates until the search is complete; any number of processes may do so.
 
-    :param config: Settings of the search
-    :param folder: Folder of the search, for checkpoints and curves
+    :param config: The search
+    :param folder: Its folder, for checkpoints and curves
     :param where: Its storage, as for ``open_storage``
-    :param stages: Number of stages instead of the config's
-    :param pruner: Pruner instead of the config's
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    sampler = make_sampler(config, stages, workers.identity())
+    sampler = AuxLossSampler(**config.sampler_settings(), worker=workers.identity())
     study = optuna.load_study(
-        study_name=config.name,
-        storage=open_storage(where),
-        sampler=sampler,
-        pruner=make_pruner(pruner or config.pruner, config),
+        study_name=study_name(config), storage=open_storage(where), sampler=sampler, pruner=make_pruner(config)
     )
     objective = Objective(config, folder)
+    artifacts = _artifacts(folder)
     failures = 0
 
     def finished(study: optuna.Study, trial: FrozenTrial) -> None:
         nonlocal failures
-        annotate_trial(study, trial, objective.artifacts)
+        annotate_trial(study, trial, artifacts)
         failures = failures + 1 if trial.state == TrialState.FAIL else 0
         if failures == MAX_FAILURES:
             reason = trial.user_attrs.get("reason")
@@ -117,43 +116,40 @@ def run_worker(config: SearchConfig, folder: Path, where: str, stages: int | Non
             return
 
 
-def search(
-    config: SearchConfig, folder: Path, where: str, n_workers: int = 1, stages: int | None = None, pruner: str | None = None
-) -> Iterator[Progress]:
+def search(config: SearchConfig, folder: Path, where: str, n_workers: int = 1) -> Iterator[Progress]:
     """
-    Run a search, or go on with it: the state is in the storage.
+    Run a search, or go on with it: all that it knows is in the storage.
 
-    Yields about once a second; stopping the iteration (or Ctrl-C) interrupts the workers.
+    Yields about once a second. Ctrl-C, or leaving the loop, interrupts the workers.
 
-    :param config: Settings of the search
-    :param folder: Folder of the search
+    :param config: The search
+    :param folder: Its folder
     :param where: Its storage, as for ``open_storage``
     :param n_workers: Number of processes on this machine
-    :param stages: Number of stages instead of the config's
-    :param pruner: Pruner instead of the config's
     """
-    sampler = make_sampler(config, stages)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = open_storage(where)
+    sampler = AuxLossSampler(**config.sampler_settings())
     study = optuna.create_study(
-        study_name=config.name, storage=open_storage(where), sampler=sampler, direction="maximize", load_if_exists=True
+        study_name=study_name(config), storage=storage, sampler=sampler, direction="maximize", load_if_exists=True
     )
     progress = look(study, sampler, n_workers)  # refuses a study that was begun with other settings
-    annotate_study(study, config.settings(), provenance())
+    annotate_study(study, settings(config), provenance())
+    lines = baseline_scores(config, storage)
     yield progress
-    with WorkerPool(run_worker, (config, folder, where, stages, pruner), n_workers) as pool:
-        finished = -1
-        while True:
+    with WorkerPool(run_worker, (config, folder, where), n_workers) as pool:
+        ended, drawn, busy = -1, 0.0, True
+        while busy:
             now = sum(stage.filled + stage.failed for stage in progress.stages)
-            if now != finished:
-                update_plots(study, config.baselines)
-            busy = pool.check(progressed=now != finished)
-            finished = now
-            if not busy:
-                break
+            if now != ended and time.monotonic() - drawn > PLOT_SECONDS:
+                update_plots(study, lines)
+                drawn = time.monotonic()
+            busy = pool.check(progressed=now != ended)
+            ended = now
             time.sleep(POLL_SECONDS)
             progress = look(study, sampler, n_workers)
             yield progress
-    update_plots(study, config.baselines)
-    yield look(study, sampler, n_workers)
+    update_plots(study, lines)
 
 
 def look(study: optuna.Study, sampler: AuxLossSampler, n_workers: int) -> Progress:
@@ -166,12 +162,18 @@ def look(study: optuna.Study, sampler: AuxLossSampler, n_workers: int) -> Progre
     """
     stages = sampler.progress(study)
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    best = max(complete, key=lambda trial: trial.value or 0.0, default=None)
+    best = next(iter(ranked(complete, study.direction)), None)
     durations = [trial.duration.total_seconds() for trial in complete if trial.duration is not None]
     left = sum(stage.places - stage.filled for stage in stages)
     return Progress(
         stages,
         None if best is None else best.value,
-        None if best is None else best.user_attrs.get("loss"),
+        None if best is None else str(loss_of(best)),
         sum(durations) / len(durations) * left / n_workers if durations else None,
     )
+
+
+def _artifacts(folder: Path) -> FileSystemArtifactStore:
+    path = folder / ARTIFACTS
+    path.mkdir(parents=True, exist_ok=True)
+    return FileSystemArtifactStore(path)

@@ -1,98 +1,175 @@
-"""Studies that train a given list of runs instead of searching: losses x environments x seeds, each once."""
+"""Studies that train a given list of runs instead of searching: variants x environments x seeds, each once."""
 
+import itertools
+import re
+import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import optuna
+import pandas as pd
 from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
 from search import workers
+from search.config import SearchConfig
+from search.objective import CandidateFailed, Objective
+from search.pool import WorkerPool
+from search.storage import open_storage
+from search.training import TrainingError
 
-# A run whose workers died, or that failed, is tried this often.
+# How often a run is tried that fails, or whose worker dies.
 MAX_TRIES = 3
-ENQUEUED_KEY = "enqueued"
+POLL_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Variant:
+    """
+    What is trained.
+
+    :param aux_loss: The auxiliary loss, None for none
+    :param overrides: Merged over the hyper-parameters
+    """
+
+    aux_loss: AuxLoss | None
+    overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Cell(NamedTuple):
     """
     One training run.
 
-    :param loss: Notation of the auxiliary loss, ``"none"`` for none
+    :param variant: Name of what is trained
     :param environment: Id of the environment
     :param seed: Seed of the training
     """
 
-    loss: str
+    variant: str
     environment: str
     seed: int
 
-    @property
-    def aux_loss(self) -> AuxLoss | None:
-        """The loss as a value."""
-        return None if self.loss == "none" else AuxLoss.parse(self.loss)
 
-
-def enqueue(study: optuna.Study, cells: Sequence[Cell]) -> int:
+@dataclass(frozen=True)
+class Grid:
     """
-    Enqueue the runs that the study does not have yet, and those whose worker died or that failed too seldom.
+    Variants x environments x seeds, as a study in the storage of a search.
 
-    :param study: The study
-    :param cells: All runs
-    :return: How many runs are finished already
-    """
-    trials = study.get_trials(deepcopy=False)
-    if workers.fail_dead(study, trials):
-        trials = study.get_trials(deepcopy=False)
-    there = {cell_of(trial) for trial in trials if trial.state != TrialState.FAIL}
-    failures = Counter(cell_of(trial) for trial in trials if trial.state == TrialState.FAIL and "reason" in trial.user_attrs)
-    for cell in cells:
-        if cell not in there and failures[cell] < MAX_TRIES:
-            study.enqueue_trial(cell._asdict(), user_attrs={ENQUEUED_KEY: True})
-    return len({cell_of(trial) for trial in trials if trial.state == TrialState.COMPLETE} & set(cells))
-
-
-def cell_of(trial: FrozenTrial) -> Cell | None:
-    """
-    The run of a trial, None for one that has none.
-
-    :param trial: A trial, waiting, running or finished
-    """
-    params = trial.params or trial.system_attrs.get("fixed_params", {})
-    return Cell(**params) if set(params) == set(Cell._fields) else None
-
-
-def suggest_cell(trial: optuna.Trial, cells: Sequence[Cell]) -> Cell:
-    """
-    The run that a trial was enqueued for.
-
-    :param trial: The trial
-    :param cells: All runs of the study
-    :raises optuna.TrialPruned: when another worker took the last run meanwhile
-    """
-    if ENQUEUED_KEY not in trial.user_attrs:
-        raise optuna.TrialPruned("no run is left")
-    choices: dict[str, list[Any]] = {name: sorted({getattr(cell, name) for cell in cells}) for name in Cell._fields}
-    return Cell(**{name: trial.suggest_categorical(name, values) for name, values in choices.items()})
-
-
-def make_study(storage: optuna.storages.BaseStorage, name: str) -> optuna.Study:
-    """
-    The study of a list of runs, made if it is not there.
-
-    :param storage: The storage
     :param name: Name of the study
+    :param config: Settings of the trainings
+    :param variants: What is trained, by name
+    :param environments: Ids of the environments
+    :param seeds: Seeds of the trainings on each
     """
-    sampler = RandomSampler(seed=0)  # draws nothing: all parameters are enqueued
-    return optuna.create_study(study_name=name, storage=storage, sampler=sampler, direction="maximize", load_if_exists=True)
+
+    name: str
+    config: SearchConfig
+    variants: Mapping[str, Variant]
+    environments: Sequence[str]
+    seeds: Sequence[int]
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All runs, seed by seed, so that a first comparison is there early."""
+        product = itertools.product(self.seeds, self.environments, self.variants)
+        return [Cell(variant, environment, seed) for seed, environment, variant in product]
 
 
-def waiting(study: optuna.Study) -> bool:
+def run(grid: Grid, folder: Path, where: str, n_workers: int = 1) -> Iterator[tuple[int, int]]:
     """
-    Whether runs are left that no worker has begun.
+    Train what the study does not have yet. Yields finished and failed runs about once a second.
+
+    :param grid: The runs
+    :param folder: Folder of the search, for checkpoints and curves
+    :param where: Storage of the search, as for ``open_storage``
+    :param n_workers: Number of processes
+    :raises TrainingError: when runs keep failing; the others were trained
+    """
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sampler = RandomSampler(seed=0)  # draws nothing: all runs are enqueued
+    storage = open_storage(where)
+    study = optuna.create_study(
+        study_name=grid.name, storage=storage, sampler=sampler, direction="maximize", load_if_exists=True
+    )
+    _enqueue(study, grid.cells)
+    finished, failed = _count(study, grid.cells)
+    yield finished, failed
+    while finished < len(grid.cells):
+        with WorkerPool(_run_worker, (grid, folder, where), n_workers) as pool:
+            busy = True
+            while busy:
+                time.sleep(POLL_SECONDS)
+                before = finished + failed
+                finished, failed = _count(study, grid.cells)
+                busy = pool.check(progressed=finished + failed > before)
+                yield finished, failed
+        if not _enqueue(study, grid.cells) and finished < len(grid.cells):
+            reasons = [trial.user_attrs.get("reason") for trial in study.get_trials(deepcopy=False, states=(TrialState.FAIL,))]
+            raise TrainingError(f"{len(grid.cells) - finished} runs failed {MAX_TRIES} times; the last reason: {reasons[-1]}")
+
+
+def scores(study: optuna.Study) -> pd.DataFrame:
+    """
+    What a grid's study has finished: one row a run with ``variant``, ``environment``, ``seed``, ``score`` (AULC) and
+    ``last`` (mean return at the last checkpoint).
 
     :param study: The study
     """
-    return bool(study.get_trials(deepcopy=False, states=(TrialState.WAITING,)))
+    rows = []
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+        cell = _cell_of(trial)
+        if cell is not None:
+            rows.append({**cell._asdict(), "score": trial.value, "last": trial.user_attrs["curve"][-1][1]})
+    columns = [*Cell._fields, "score", "last"]
+    return pd.DataFrame(rows, columns=columns).drop_duplicates(list(Cell._fields))
+
+
+def _enqueue(study: optuna.Study, cells: Sequence[Cell]) -> int:
+    """Enqueue the runs that nobody has or had, and those that did not fail too often; how many."""
+    workers.fail_dead(study, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
+    trials = study.get_trials(deepcopy=False)
+    there = {_cell_of(trial) for trial in trials if trial.state != TrialState.FAIL}
+    failures = Counter(
+        _cell_of(trial) for trial in trials if trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted")
+    )
+    missing = [cell for cell in cells if cell not in there and failures[cell] < MAX_TRIES]
+    for cell in missing:
+        # As attributes: parameters of Optuna could not take a seed more when a grid grows.
+        study.enqueue_trial({}, user_attrs=cell._asdict())
+    return len(missing)
+
+
+def _count(study: optuna.Study, cells: Sequence[Cell]) -> tuple[int, int]:
+    trials = study.get_trials(deepcopy=False)
+    finished = {_cell_of(trial) for trial in trials if trial.state == TrialState.COMPLETE}
+    return len(finished & set(cells)), sum(trial.state == TrialState.FAIL for trial in trials)
+
+
+def _cell_of(trial: FrozenTrial | optuna.Trial) -> Cell | None:
+    if not set(Cell._fields) <= set(trial.user_attrs):
+        return None
+    return Cell(*(trial.user_attrs[name] for name in Cell._fields))
+
+
+def _run_worker(grid: Grid, folder: Path, where: str) -> None:
+    """Train runs while any is left that no worker has begun."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.load_study(study_name=grid.name, storage=open_storage(where), sampler=RandomSampler(seed=0))
+
+    def objective(trial: optuna.Trial) -> float:
+        cell = _cell_of(trial)
+        if cell is None:
+            raise optuna.TrialPruned("another worker took the last run")
+        trial.set_user_attr(workers.WORKER_KEY, workers.identity())
+        variant = grid.variants[cell.variant]
+        # A folder of its own: two variants may have one loss.
+        name = re.sub(r"[^a-z0-9]+", "-", cell.variant.lower())[:80].strip("-")
+        train = Objective(grid.config, folder / grid.name / name).train
+        return train(trial, variant.aux_loss, cell.environment, [cell.seed], variant.overrides)
+
+    while study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
+        study.optimize(objective, n_trials=1, catch=(CandidateFailed,))

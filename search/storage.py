@@ -14,16 +14,21 @@ SQLITE_TIMEOUT = 120
 HEARTBEAT_INTERVAL = 60
 
 
-def open_storage(where: str | Path) -> BaseStorage:
+def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
     """
-    Open a storage, and make it if it is not there.
+    Open a storage.
 
     :param where: A folder, for the embedded journal in it, which is safe for several processes of one machine; a file
         that ends in ``.log``, for a journal; or the URL of a database, such as ``sqlite:///study.db`` or
         ``postgresql://user:password@host/database``
+    :param create: Whether to make a journal that is not there
     :raises ValueError: when it cannot be opened; passwords are left out of the message
     """
     where = str(where)
+    path = Path(where)
+    path = path if path.suffix == ".log" else path / JOURNAL
+    if "://" not in where and not create and not path.exists():
+        raise ValueError(f"there is no study in {where}: {path} does not exist")
     try:
         if "://" in where:
             connect_args = {"timeout": SQLITE_TIMEOUT} if where.startswith("sqlite") else {}
@@ -33,8 +38,6 @@ def open_storage(where: str | Path) -> BaseStorage:
                 heartbeat_interval=HEARTBEAT_INTERVAL,
                 failed_trial_callback=None,
             )
-        path = Path(where)
-        path = path if path.suffix == ".log" else path / JOURNAL
         path.parent.mkdir(parents=True, exist_ok=True)
         return JournalStorage(JournalFileBackend(str(path)))
     except Exception as error:  # whatever a driver raises

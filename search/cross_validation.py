@@ -1,0 +1,76 @@
+"""Cross-validation of a search's best candidates (paper, A.4): the best on one environment may have overfitted to it."""
+
+from pathlib import Path
+
+import optuna
+import pandas as pd
+import yaml
+
+from sb3_aarl.aux_loss import AuxLoss
+from search.config import ConfigError, SearchConfig
+from search.grid import Grid, Variant
+from search.trials import loss_of, ranked
+
+
+def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
+    """
+    The best candidates of a search, the best first, in canonical form and each once.
+
+    :param study: A study of losses
+    :param top: How many
+    :raises ValueError: when no candidate is complete
+    """
+    losses: dict[AuxLoss, None] = {}
+    for trial in ranked(study.get_trials(deepcopy=False), study.direction):
+        loss = loss_of(trial)
+        if loss is not None:
+            losses[loss.canonical()] = None
+    if not losses:
+        raise ValueError(f"study {study.study_name!r} has no completed candidate yet")
+    return list(losses)[:top]
+
+
+def make_grid(config: SearchConfig, study: optuna.Study, top: int | None = None) -> Grid:
+    """
+    The runs of a cross-validation: candidates x environments x seeds.
+
+    :param config: Settings of the search, with a section ``cross_validation``
+    :param study: The search
+    :param top: How many candidates, None for the config's number
+    """
+    section = config.cross_validation
+    if section is None:
+        raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
+    losses = top_losses(study, section.top if top is None else top)
+    variants = {str(loss): Variant(loss) for loss in losses}
+    return Grid(f"{study.study_name}-cross-validation", config, variants, section.environments, section.seeds)
+
+
+def ranking(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    The candidates by their mean AULC over all environments (paper, A.4), the best first.
+
+    :param runs: As :func:`search.grid.scores` gives them
+    :return: One row a candidate: mean score on each environment, then ``mean``, ``std`` over all runs, and ``runs``
+    """
+    by_environment = runs.pivot_table(index="variant", columns="environment", values="score", aggfunc="mean")
+    by_variant = runs.groupby("variant")["score"]
+    # The mean of the environments' means: each counts alike, however many seeds it has so far.
+    overall = pd.DataFrame({"mean": by_environment.mean(axis=1), "std": by_variant.std(ddof=0), "runs": by_variant.count()})
+    return by_environment.join(overall).sort_values("mean", ascending=False)
+
+
+def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
+    """
+    Write the best candidate as YAML: a mapping whose ``aux_loss`` is what SACAux and hyper-parameter files take.
+
+    :param table: As :func:`ranking` gives it
+    :param path: Where it goes
+    :return: The best candidate
+    """
+    winner = AuxLoss.parse(str(table.index[0]))
+    score = {"mean_aulc": round(float(table["mean"].iloc[0]), 3), "runs": int(table["runs"].iloc[0])}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    comment = f"# Best of {len(table)} candidates in cross-validation: {score}\n"
+    path.write_text(comment + yaml.safe_dump({"aux_loss": winner}, sort_keys=False), encoding="utf-8")
+    return winner
