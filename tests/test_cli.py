@@ -1,0 +1,122 @@
+"""The program: train and losses, as a user calls them."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from sb3_aarl import AuxLoss, SACAux, catalog
+from sb3_aarl.callbacks import read_curve
+from search.cli import ZOO, app
+
+ROOT = Path(__file__).parent.parent
+HYPER = {
+    "default": {
+        "n_timesteps": 60,
+        "env_kwargs": {"action_repeat": 40},
+        "buffer_size": 1000,
+        "learning_starts": 20,
+        "batch_size": 8,
+        "predictor_width": 8,
+        "policy_kwargs": {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8, "width": 8}},
+    }
+}
+
+
+runner = CliRunner(env={"COLUMNS": "200", "TERM": "dumb"})
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the program runs."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hyper.yml").write_text(yaml.safe_dump(HYPER))
+    return tmp_path
+
+
+def test_train_shows_the_curve_and_says_where_the_model_is(folder: Path) -> None:
+    options = ("--config", "hyper.yml", "--evaluations", "2", "--episodes", "1", "--seed", "4", "--out", "here")
+    command = [
+        sys.executable,
+        "-m",
+        "search.cli",
+        "train",
+        "cartpole-balance",
+        "--aux-loss",
+        "{s_t} -> {r_t, s_t+1}",
+        *options,
+    ]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", "TERM": "dumb"}
+    result = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert result.returncode == 0, result.stderr
+    curve = read_curve(folder / "here" / "curve.csv")
+    # 60 agent steps of 40 simulator steps each.
+    assert [point.environment_steps for point in curve] == [1200, 2400]
+    for point in curve:
+        assert re.search(rf"{point.environment_steps:,}\D+{point.mean:.1f}\D+{point.std:.1f}", result.stdout)
+    assert f"AULC {(curve[0].mean + curve[1].mean) / 2:.1f}" in result.stdout
+    assert "here/model.zip" in result.stdout and "here/curve.csv" in result.stdout
+    model = SACAux.load(folder / "here" / "model.zip")
+    assert model.aux_loss == AuxLoss.parse("{s_t} -> {r_t, s_t+1}")
+    assert (model.seed, model.num_timesteps, model.batch_size) == (4, 60, 8)
+    assert "60/60" in result.stdout + result.stderr  # the progress bar
+
+
+def test_train_without_an_auxiliary_loss_into_a_folder_of_its_own(folder: Path) -> None:
+    options = ["--config", "hyper.yml", "--steps", "400", "--evaluations", "1", "--episodes", "1"]
+    result = runner.invoke(app, ["train", "dm_control/cartpole-balance-v0", "--aux-loss", "none", *options])
+    assert result.exit_code == 0, result.stderr
+    (model,) = Path("runs").glob("*/model.zip")
+    assert str(model) in result.stdout
+    assert SACAux.load(model).aux_loss is None
+    assert model.parent.name.startswith("cartpole-balance")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["cartpole-blance"], "nearest: cartpole-balance"),
+        (["cartpole-balance", "--aux-loss", "curll"], "nearest: curl"),
+        (["cartpole-balance", "--aux-loss", "{s_t} -> {q_t}"], "position 10"),
+        (["cartpole-balance", "--steps", "100", "--evaluations", "5"], "too few"),
+        (["cartpole-balance", "--config", "missing.yml"], "missing.yml: cannot be read"),
+        (["cartpole-balance", "--steps", "many"], "--steps"),
+    ],
+    ids=["environment", "name", "notation", "steps", "file", "number"],
+)
+def test_errors_are_clear_and_exit_with_2(arguments: list[str], message: str) -> None:
+    if "--config" not in arguments:
+        arguments = [*arguments, "--config", "hyper.yml"]
+    result = runner.invoke(app, ["train", *arguments])
+    assert result.exit_code == 2
+    assert message in result.stderr and "Traceback" not in result.stderr
+    assert not Path("runs").exists()
+    if message != "--steps":  # that one is typer's own box
+        assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_losses_lists_the_whole_catalogue() -> None:
+    result = runner.invoke(app, ["losses"])
+    assert result.exit_code == 0, result.stderr
+    rows = [[cell.strip() for cell in line.split("│")[1:4]] for line in result.stdout.splitlines() if line.startswith("│")]
+    table: dict[str, list[str]] = {}
+    for name, notation, operator in rows:
+        if name:
+            table[name] = [notation, operator]
+        else:  # a long notation goes on in the next line
+            last = table[list(table)[-1]]
+            last[0] += f" {notation}"
+    assert list(table) == catalog.names()
+    for name, (notation, operator) in table.items():
+        loss = catalog.load(name)
+        measure, _, negatives = operator.partition(", ")
+        assert AuxLoss.parse(notation, measure, negatives == "negatives") == loss
+
+
+def test_the_default_file_of_hyperparameters_is_there() -> None:
+    assert (ZOO / "aarl_state.yml").is_file()

@@ -1,0 +1,466 @@
+"""Training a candidate: reports, pruning, failures that stay its own, and going on after a kill."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import optuna
+import pytest
+import torch as th
+import yaml
+from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
+from optuna.samplers import RandomSampler
+from optuna.trial import FrozenTrial, TrialState
+
+from sb3_aarl import AuxLoss, SACAux
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, aulc, read_curve
+from sb3_aarl.envs import make_dmc_env
+from search import training
+from search.config import load_config
+from search.objective import CandidateFailed, Objective, make_pruner, mean_curve
+from search.sampler import AuxLossSampler
+from search.space import loss_to_params
+from search.training import TrainingError, spread_checkpoints, train_candidate
+
+LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
+ENV = "dm_control/cartpole-balance-v0"
+# 25 agent steps are an episode.
+HYPER: dict[str, Any] = {
+    "env_kwargs": {"action_repeat": 40},
+    "buffer_size": 1000,
+    "learning_starts": 10,
+    "batch_size": 8,
+    "predictor_width": 8,
+    "policy_kwargs": {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8, "width": 8}},
+    "device": "cpu",
+}
+CHECKPOINTS = (800, 1600, 2400)
+
+
+class Broken(gym.Env):
+    """Fails in a way of its own after some steps."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, render_mode: str | None = None, failure: str = "raise", after: int = 30):
+        self.failure = failure
+        self.after = after
+        self.steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.steps += 1
+        if self.steps > self.after:
+            if self.failure == "raise":
+                raise RuntimeError("the simulator\nexploded")
+            if self.failure == "memory":
+                raise MemoryError("no memory left")
+            if self.failure == "interrupt":
+                raise KeyboardInterrupt
+            return np.full(2, np.nan, np.float32), 0.0, False, False, {}
+        return np.zeros(2, np.float32), 0.0, False, self.steps % 10 == 0, {}
+
+
+for failure in ("raise", "memory", "interrupt", "diverge"):
+    gym.register(f"Broken-{failure}-v0", Broken, kwargs={"failure": failure}, disable_env_checker=True)
+
+
+def make_objective(folder: Path, **settings: Any) -> Objective:
+    (folder / "hyper.yml").write_text(yaml.safe_dump({"default": HYPER}))
+    values = {
+        "environment": ENV,
+        "hyperparameters": "hyper.yml",
+        "checkpoints": list(CHECKPOINTS[:2]),
+        "evaluation_episodes": 1,
+        "max_horizon": 2,
+        **settings,
+    }
+    (folder / "search.yml").write_text(yaml.safe_dump(values))
+    return Objective(load_config(folder / "search.yml"), folder / "runs", threads=1)
+
+
+def make_study(pruner: BasePruner | None = None, losses: int = 1) -> optuna.Study:
+    study = optuna.create_study(direction="maximize", sampler=RandomSampler(seed=0), pruner=pruner or NopPruner())
+    for i in range(losses):
+        study.enqueue_trial(loss_to_params(AuxLoss.parse("{s_t} -> {r_t}" if i % 2 else str(LOSS))))
+    return study
+
+
+# Training.
+
+
+def test_the_curve_is_that_of_a_plain_training(tmp_path: Path) -> None:
+    told: list[Evaluation] = []
+    run = train_candidate(ENV, LOSS, HYPER, 3, CHECKPOINTS, 2, tmp_path / "run", told.append)
+    settings = {key: value for key, value in HYPER.items() if key != "env_kwargs"}
+    model = SACAux("MlpPolicy", make_dmc_env(ENV, action_repeat=40, seed=3), aux_loss=LOSS, seed=3, **settings)
+    curve = LearningCurveCallback(make_dmc_env(ENV, action_repeat=40), CHECKPOINTS, 2, seed=10_003)
+    model.learn(60, curve)
+    assert [point[:4] for point in run.curve] == [point[:4] for point in curve.curve]
+    assert run.aulc == pytest.approx(np.mean([point.mean for point in curve.curve]))
+    assert told == run.curve == read_curve(tmp_path / "run" / "curve.csv")
+    # The replay buffer is gone.
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["curve.csv", "run.json"]
+
+
+def test_other_gymnasium_environments(tmp_path: Path) -> None:
+    run = train_candidate("Pendulum-v1", None, HYPER | {"env_kwargs": {"frame_stack": 2}}, 0, [30, 60], 1)
+    assert [point.environment_steps for point in run.curve] == [30, 60]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_finished_training_is_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = (ENV, LOSS, HYPER, 0, [400], 1, tmp_path)
+    first = train_candidate(*arguments)
+    other = train_candidate(*arguments[:3], 1, *arguments[4:])  # another seed does not take it for its own
+    assert other.curve[0][:2] != first.curve[0][:2]
+    monkeypatch.setattr(training, "make_env", None)
+    told: list[Evaluation] = []
+    assert train_candidate(ENV, LOSS, HYPER, 1, [400], 1, tmp_path, told.append) == other
+    assert told == other.curve
+
+
+def test_the_model_is_kept_and_never_overwritten(tmp_path: Path) -> None:
+    run = train_candidate(ENV, LOSS, HYPER, 0, [800], 1, tmp_path, keep_model=True)
+    model = SACAux.load(tmp_path / "model.zip")
+    assert model.num_timesteps == 20 and model.aux_loss == LOSS
+    env = make_dmc_env(ENV, action_repeat=40)
+    observation, _ = env.reset(seed=10_000)
+    total, over = 0.0, False
+    while not over:
+        observation, reward, _, over, _ = env.step(model.predict(observation, deterministic=True)[0])
+        total += reward
+    # Evaluated one gradient step before the end.
+    assert total == pytest.approx(run.curve[-1].mean, rel=0.1)
+    with pytest.raises(FileExistsError, match="another training"):
+        train_candidate(ENV, LOSS, HYPER, 1, [800], 1, tmp_path, keep_model=True)
+    assert SACAux.load(tmp_path / "model.zip").seed == 0
+
+
+@pytest.mark.parametrize(
+    ("steps", "n", "repeat", "expected"),
+    [(500_000, 5, 4, (100_000, 200_000, 300_000, 400_000, 500_000)), (1000, 3, 8, (328, 656, 984)), (7, 1, 4, (4,))],
+)
+def test_checkpoints_are_spread(steps: int, n: int, repeat: int, expected: tuple[int, ...]) -> None:
+    assert spread_checkpoints(steps, n, repeat) == expected
+
+
+def test_too_few_steps_are_refused() -> None:
+    with pytest.raises(ValueError, match="too few"):
+        spread_checkpoints(30, 4, 8)
+
+
+# Checkpoints.
+
+SCRIPT = """
+import json, os, signal, sys
+from search.training import train_candidate
+arguments = json.loads(sys.argv[1])
+
+def on_evaluation(evaluation):
+    print(evaluation.environment_steps, flush=True)
+    if evaluation.environment_steps == arguments["checkpoints"][1]:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+train_candidate(**arguments, on_evaluation=on_evaluation, threads=1)
+"""
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a training in another process, which killed itself at its second evaluation."""
+    folder, root = tmp_path_factory.mktemp("killed"), Path(__file__).parent.parent
+    arguments = {
+        "environment": ENV,
+        "aux_loss": str(LOSS),
+        "hyperparameters": HYPER,
+        "seed": 0,
+        "checkpoints": CHECKPOINTS,
+        "evaluation_episodes": 1,
+        "folder": str(folder),
+    }
+    command = [sys.executable, "-c", SCRIPT, json.dumps(arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    process = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    assert process.stdout.split() == ["800", "1600"]
+    return folder
+
+
+def copy(folder: Path, to: Path) -> Path:
+    return Path(shutil.copytree(folder, to / "copy"))
+
+
+def trained_steps(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
+    """Agent steps, gradient steps and transitions in the buffer with which each learning begins."""
+    begins: list[tuple[int, int, int]] = []
+    learn = SACAux.learn
+
+    def watched(self: SACAux, *args: Any, **kwargs: Any) -> SACAux:
+        begins.append((self.num_timesteps, self._n_updates, self.replay_buffer.size()))
+        return learn(self, *args, **kwargs)
+
+    monkeypatch.setattr(SACAux, "learn", watched)
+    return begins
+
+
+def test_a_killed_training_goes_on_from_its_checkpoint(killed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = copy(killed, tmp_path)
+    assert [path.name for path in (folder / "checkpoint").iterdir()] == ["800"]
+    before = read_curve(folder / "checkpoint" / "800" / "curve.csv")
+    begins = trained_steps(monkeypatch)
+    told: list[Evaluation] = []
+    run = train_candidate(ENV, str(LOSS), HYPER, 0, CHECKPOINTS, 1, folder, told.append)
+    # 20 agent steps, of which 10 were random: all stored, all trained on.
+    assert begins == [(20, 10, 20)]
+    assert run.curve[:1] == before and told == run.curve
+    assert [point.environment_steps for point in run.curve] == list(CHECKPOINTS)
+    assert all(later.seconds > earlier.seconds for earlier, later in zip(run.curve, run.curve[1:], strict=False))
+    assert not (folder / "checkpoint").exists()
+
+
+def truncate(name: str) -> Callable[[Path], None]:
+    def tear(checkpoint: Path) -> None:
+        content = (checkpoint / name).read_bytes()
+        (checkpoint / name).write_bytes(content[: len(content) // 2])
+
+    return tear
+
+
+def rename(checkpoint: Path) -> None:
+    checkpoint.rename(checkpoint.with_name("unfinished"))
+
+
+@pytest.mark.parametrize(
+    "tear",
+    [*map(truncate, ("model.zip", "replay_buffer.pkl", "run.json")), lambda path: (path / "curve.csv").unlink(), rename],
+    ids=["model", "buffer", "description", "curve", "unfinished"],
+)
+def test_a_torn_checkpoint_is_refused(
+    killed: Path,
+    tmp_path: Path,
+    tear: Callable[[Path], None],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    folder = copy(killed, tmp_path)
+    tear(folder / "checkpoint" / "800")
+    begins = trained_steps(monkeypatch)
+    run = train_candidate(ENV, str(LOSS), HYPER, 0, CHECKPOINTS, 1, folder)
+    assert begins == [(0, 0, 0)]
+    assert [point.environment_steps for point in run.curve] == list(CHECKPOINTS)
+    assert ("training begins anew" in caplog.text) is (tear is not rename)
+    assert read_curve(folder / "curve.csv") == run.curve
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"aux_loss": "{s_t} -> {r_t}"}, {"hyperparameters": {"gamma": 0.9}}], ids=str)
+def test_a_foreign_checkpoint_is_refused(
+    killed: Path, tmp_path: Path, change: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = copy(killed, tmp_path)
+    begins = trained_steps(monkeypatch)
+    settings = {"aux_loss": str(LOSS), "seed": 0} | change
+    settings["hyperparameters"] = HYPER | change.get("hyperparameters", {})
+    train_candidate(ENV, **settings, checkpoints=CHECKPOINTS, evaluation_episodes=1, folder=folder)
+    assert begins == [(0, 0, 0)]
+    assert "other settings" in caplog.text
+
+
+def test_a_checkpoint_appears_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the second one is written, the first one is whole."""
+    seen: list[list[str]] = []
+    save = SACAux.save_replay_buffer
+
+    def watched(self: SACAux, path: Path) -> None:
+        seen.append(sorted(folder.name for folder in (tmp_path / "checkpoint").iterdir()))
+        save(self, path)
+
+    monkeypatch.setattr(SACAux, "save_replay_buffer", watched)
+    train_candidate(ENV, LOSS, HYPER, 0, CHECKPOINTS, 1, tmp_path)
+    assert seen == [["unfinished"], ["800", "unfinished"]]
+
+
+# The objective.
+
+
+def test_reports_and_attributes_are_those_of_the_curve(tmp_path: Path) -> None:
+    study = make_study()
+    study.optimize(make_objective(tmp_path), n_trials=1)
+    trial = study.trials[0]
+    (path,) = (tmp_path / "runs").rglob("curve.csv")
+    curve = read_curve(path)
+    assert [point.environment_steps for point in curve] == [800, 1600]
+    assert trial.intermediate_values == {point.environment_steps: point.mean for point in curve}
+    assert trial.value == pytest.approx(aulc(curve))
+    attributes = trial.user_attrs
+    assert attributes["curve"] == [[point.environment_steps, point.mean, point.std] for point in curve]
+    assert attributes["loss"] == attributes["canonical"] == str(LOSS)
+    assert attributes["environment"] == ENV
+    assert attributes["seconds"] == round(curve[-1].seconds, 1)
+    assert attributes["commit"]
+
+
+def test_several_seeds(tmp_path: Path) -> None:
+    study = make_study()
+    study.optimize(make_objective(tmp_path, seeds=[5, 6]), n_trials=1)
+    trial = study.trials[0]
+    curves = [read_curve(path) for path in sorted((tmp_path / "runs").rglob("curve.csv"))]
+    assert [path.parent.name for path in sorted((tmp_path / "runs").rglob("curve.csv"))] == ["seed-5", "seed-6"]
+    assert trial.value == pytest.approx(np.mean([aulc(curve) for curve in curves]))
+    assert trial.intermediate_values == {point.environment_steps: point.mean for point in curves[0]}
+    assert [point[1] for point in trial.user_attrs["curve"]] == pytest.approx(
+        [np.mean([curve[i].mean for curve in curves]) for i in range(2)]
+    )
+
+
+def test_the_mean_curve_is_over_all_episodes() -> None:
+    returns = np.random.default_rng(0).normal(size=(3, 2, 10))  # seed, evaluation, episode
+    curves = [
+        [Evaluation(100 * (i + 1), float(row.mean()), float(row.std()), 10, 1.0) for i, row in enumerate(seed)]
+        for seed in returns
+    ]
+    for i, (steps, mean, deviation) in enumerate(mean_curve(curves)):
+        assert steps == 100 * (i + 1)
+        assert (mean, deviation) == (pytest.approx(returns[:, i].mean()), pytest.approx(returns[:, i].std()))
+
+
+class PruneAt(BasePruner):
+    def __init__(self, step: int):
+        self.step = step
+
+    def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
+        return trial.last_step == self.step
+
+
+@pytest.mark.parametrize(("step", "state"), [(800, TrialState.PRUNED), (1600, TrialState.COMPLETE)])
+def test_the_pruner_decides_except_at_the_end(tmp_path: Path, step: int, state: TrialState) -> None:
+    study = make_study(PruneAt(step))
+    study.optimize(make_objective(tmp_path, seeds=[0, 1]), n_trials=1)
+    trial = study.trials[0]
+    assert trial.state == state
+    pruned = state == TrialState.PRUNED
+    assert len(trial.user_attrs["curve"]) == (1 if pruned else 2)
+    # No other seed was trained, and nothing large is left.
+    assert len(list((tmp_path / "runs").rglob("curve.csv"))) == (1 if pruned else 2)
+    assert not list((tmp_path / "runs").rglob("checkpoint"))
+
+
+def test_pruners_of_a_configuration(tmp_path: Path) -> None:
+    types = {"none": NopPruner, "median": MedianPruner, "hyperband": HyperbandPruner}
+    for name, expected in types.items():
+        assert type(make_pruner(make_objective(tmp_path, pruner=name).config)) is expected
+    # Hyperband needs steps to work on: its first rung is the first checkpoint.
+    study = make_study(make_pruner(make_objective(tmp_path, pruner="hyperband").config), losses=2)
+    study.optimize(make_objective(tmp_path, pruner="hyperband"), n_trials=2)
+    assert {trial.state for trial in study.trials} <= {TrialState.COMPLETE, TrialState.PRUNED}
+
+
+@pytest.mark.parametrize(
+    ("failure", "reason"),
+    [
+        ("raise", "RuntimeError: the simulator exploded"),
+        ("memory", "MemoryError: no memory left"),
+        ("diverge", "NonFiniteError: observation from the environment is not finite at agent step 31 (index [0, 0])"),
+    ],
+)
+def test_a_candidate_fails_alone(tmp_path: Path, failure: str, reason: str) -> None:
+    env_id, overrides = f"Broken-{failure}-v0", {"env_kwargs": {"action_repeat": 1}}
+    objective = make_objective(tmp_path, environment=env_id, checkpoints=[16, 80], overrides=overrides)
+    study = make_study(losses=2)
+    study.optimize(objective, n_trials=2, catch=CandidateFailed)
+    assert [trial.state for trial in study.trials] == [TrialState.FAIL] * 2
+    assert {trial.user_attrs["reason"] for trial in study.trials} == {reason}
+    # What it learned until then stays, its replay buffer does not.
+    assert study.trials[0].intermediate_values == {16: 0.0}
+    assert len(list((tmp_path / "runs").rglob("curve.csv"))) == 2
+    assert not list((tmp_path / "runs").rglob("checkpoint"))
+
+
+def test_a_diverging_training_fails_alone(tmp_path: Path) -> None:
+    study = make_study()
+    study.optimize(make_objective(tmp_path, overrides={"learning_rate": 1e30}), n_trials=1, catch=CandidateFailed)
+    assert study.trials[0].state == TrialState.FAIL
+    assert "NonFiniteError" in study.trials[0].user_attrs["reason"] and str(LOSS) in study.trials[0].user_attrs["reason"]
+
+
+def test_settings_that_no_candidate_can_work_with_stop_the_study(tmp_path: Path) -> None:
+    study = make_study()
+    with pytest.raises(ValueError, match="policy_delay"):
+        study.optimize(make_objective(tmp_path, overrides={"policy_delay": 0}), n_trials=1, catch=CandidateFailed)
+
+
+def test_an_invalid_candidate_costs_nothing(tmp_path: Path) -> None:
+    study = make_study(losses=0)
+    study.enqueue_trial({**loss_to_params(LOSS), "source/s_t": False})
+    study.optimize(make_objective(tmp_path), n_trials=1)
+    assert study.trials[0].state == TrialState.PRUNED
+    assert not (tmp_path / "runs").exists()
+
+
+def test_ctrl_c_leaves_the_checkpoint_and_another_trial_of_the_place_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objective = make_objective(tmp_path)
+    sampler = AuxLossSampler(population_size=2, n_random=2, n_prior=0, max_horizon=2, seed=0)
+    study = optuna.create_study(direction="maximize", sampler=sampler)
+    evaluate = training.LearningCurveCallback._evaluate
+
+    def interrupted(self: Any) -> bool:
+        if self.curve:
+            raise KeyboardInterrupt
+        return evaluate(self)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(training.LearningCurveCallback, "_evaluate", interrupted)
+        study.optimize(objective, n_trials=1, catch=CandidateFailed)
+    first = study.trials[0]
+    assert first.state == TrialState.FAIL and first.user_attrs["interrupted"] is True
+    assert "reason" not in first.user_attrs
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name.startswith(f"stage-{first.user_attrs['stage']}-place-{first.user_attrs['place']}-")
+
+    begins = trained_steps(monkeypatch)
+    study.optimize(objective, n_trials=2, catch=CandidateFailed)
+    again = next(trial for trial in study.trials[1:] if trial.user_attrs["place"] == first.user_attrs["place"])
+    assert again.user_attrs["loss"] == first.user_attrs["loss"]
+    assert again.state == TrialState.COMPLETE
+    assert begins[again.number - 1][0] == 20  # agent steps at the first checkpoint
+    assert again.intermediate_values.keys() == {800, 1600}
+    assert again.intermediate_values[800] == first.intermediate_values[800]
+
+
+def test_procedures_that_do_not_search_train_given_losses(tmp_path: Path) -> None:
+    objective = make_objective(tmp_path)
+    study = optuna.create_study(direction="maximize")
+    trial = study.ask()
+    identity = {"policy_kwargs": {"features_extractor_class": "identity", "features_extractor_kwargs": None}}
+    score = objective.train(trial, None, ENV, [2], identity)
+    assert trial.user_attrs["loss"] == trial.user_attrs["canonical"] == "none"
+    assert score == pytest.approx(np.mean([point[1] for point in trial.user_attrs["curve"]]))
+
+
+def test_threads_are_those_asked_for() -> None:
+    before = th.get_num_threads()
+    try:
+        train_candidate("Pendulum-v1", None, HYPER | {"env_kwargs": {}}, 0, [2], 1, threads=2)
+        assert th.get_num_threads() == 2
+    finally:
+        th.set_num_threads(before)
+
+
+def test_a_failure_has_a_cause(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError) as error:
+        train_candidate("Broken-raise-v0", LOSS, HYPER | {"env_kwargs": {}}, 0, [80], 1, tmp_path)
+    assert isinstance(error.value.__cause__, RuntimeError)
