@@ -12,7 +12,10 @@ BROWSER := chromium chromium-driver
 .PHONY: demo test lint system clean
 
 demo: $(VENV)/.installed
-	$(BIN)/python -m search.demo --out runs/demo
+	$(BIN)/aarl search zoo_configs/search/demo.yml --workers 2
+	$(BIN)/aarl cross-validate zoo_configs/search/demo.yml --workers 2
+	$(BIN)/aarl train cheetah-run --config zoo_configs/demo.yml --aux-loss runs/demo/winner.yml --out runs/demo/winner
+	$(BIN)/aarl report runs/demo --config zoo_configs/search/demo.yml
 
 test: $(VENV)/.installed-dev system
 	$(BIN)/python -m pytest -n 2

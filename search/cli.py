@@ -54,7 +54,7 @@ def train(
     env: Annotated[str, typer.Argument(help="Such as cheetah-run, dm_control/cheetah-run-v0 or Pendulum-v1.")],
     aux_loss: Annotated[
         str | None,
-        typer.Option(help="Notation, name of the catalogue, 'none' or 'auto'. Default: the file's, or auto."),
+        typer.Option(help="Notation, name, YAML file of a winner, 'none' or 'auto'. Default: the file's, or auto."),
     ] = None,
     config: Annotated[Path, typer.Option(help="File of hyper-parameters.", show_default="zoo_configs/aarl_state.yml")] = ZOO
     / "aarl_state.yml",
@@ -193,8 +193,10 @@ def _train_grid(grid: "Grid", folder: Path, storage: str | None, workers: int) -
 
 def _show(frame: "pd.DataFrame", title: str) -> None:
     """A table of numbers by name."""
-    table = Table(str(frame.index.name), *map(str, frame.columns), title=title)
+    table = Table(str(frame.index.name), title=title)
     table.columns[0].overflow = "fold"
+    for column in frame.columns:
+        table.add_column(str(column).removeprefix("dm_control/").removesuffix("-v0"), justify="right", no_wrap=True)
     for name, row in frame.iterrows():
         cells = (str(int(value)) if column == "runs" else f"{value:.3f}" for column, value in row.items())
         table.add_row(escape(str(name)), *cells)

@@ -206,6 +206,20 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     return _checked_hyperparameters(merged, env_id, str(path))
 
 
+def load_aux_loss(path: str | Path) -> AuxLoss:
+    """
+    Read the loss that a cross-validation chose.
+
+    :param path: YAML file with ``aux_loss``: a notation, a name, or the mapping of ``AuxLoss.to_dict``
+    :raises ConfigError: naming the file and what is wrong with it
+    """
+    path = Path(path)
+    loss = _mapping(_read(path), {"aux_loss": AuxLoss}, str(path), path.parent).get("aux_loss")
+    if loss is None:
+        raise ConfigError(f"{path}: aux_loss is missing")
+    return loss
+
+
 def resolve_env_id(name: str) -> str:
     """
     The id of an environment.

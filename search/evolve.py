@@ -92,7 +92,7 @@ def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
     study = optuna.load_study(
         study_name=study_name(config), storage=open_storage(where), sampler=sampler, pruner=make_pruner(config)
     )
-    objective = Objective(config, folder)
+    objective = Objective(config, folder / "candidates")
     artifacts = _artifacts(folder)
     failures = 0
 

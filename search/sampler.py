@@ -87,6 +87,10 @@ class _Register:
         self.open: set[int] = set()  # numbers of trials that are not finished
         self.places: dict[int, tuple[int, int]] = {}  # stage and place of each trial that has one
         self.holders: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # and the other way, in order
+        # Trials with parameters but no place: once seen, and seen again. A database reads the parameters of a trial a
+        # little later than its place, so that a trial of this sampler may look like that once.
+        self._suspects: set[int] = set()
+        self._strangers: set[int] = set()
 
     def refresh(self, trials: Sequence[FrozenTrial]) -> None:
         changed = [*self.open, *range(len(self.trials), len(trials))]
@@ -100,6 +104,8 @@ class _Register:
                 if place is not None:
                     self.places[number] = place
                     bisect.insort(self.holders[place], number)
+            if place is None and trials[number].params:
+                (self._strangers if number in self._suspects else self._suspects).add(number)
             (self.open.discard if trials[number].state.is_finished() else self.open.add)(number)
 
     def held_by(self, stage: int, place: int) -> list[FrozenTrial]:
@@ -133,7 +139,7 @@ class _Register:
             if other < number
             and other not in self.places
             and self.trials[other].state == TrialState.RUNNING
-            and not self.trials[other].params  # one with parameters comes from another sampler
+            and other not in self._strangers
         ]
 
 
@@ -384,20 +390,15 @@ class AuxLossSampler(BaseGASampler):
                 # Choosing in the order of numbers: nobody else chooses while no trial before this one is without a place.
                 # A copy of a trial whose worker died brings its place.
                 ahead = [] if trial.number in register.places else register.unplaced_before(trial.number)
-                free = None
-                if not ahead and trial.number not in register.places:
-                    is_given = bool(trial.params) or "fixed_params" in trial.system_attrs
-                    free = self._first_free(study, is_given)
-                    if free is not None:
-                        self._take(study, trial, *free, is_given)
-                        self._refresh(study)
                 if trial.number in register.places:
                     if not register.is_shared(trial.number):
                         return
-                    # Enqueued trials and copies come out of turn, and may take a place at the same moment as another.
-                    # Whoever finds on looking back that he is not alone gives way: one at least of two does find it.
-                    study._storage.set_trial_system_attr(trial._trial_id, PLACE_KEY, None)
-                    self._evolution = None  # its seed may not be the other's
+                    self._give_back(study, trial)
+                elif not ahead:
+                    is_given = bool(trial.params) or "fixed_params" in trial.system_attrs
+                    free = self._first_free(study, is_given)
+                    if free is not None and self._take(study, trial, *free, is_given):
+                        return
                 running = [register.trials[number] for number in register.open if number != trial.number]
             if self.worker is not None:
                 workers.fail_dead(study, running)
@@ -424,7 +425,8 @@ class AuxLossSampler(BaseGASampler):
     def _free(self, stage: int) -> list[int]:
         return [place for place in range(len(self.operations(stage))) if not self._register.held_by(stage, place)]
 
-    def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int, is_given: bool) -> None:
+    def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int, is_given: bool) -> bool:
+        """Take a place for a trial; False if another one did so at the same moment."""
         evolution = self._get_evolution(study)
         attempt = self._register.attempt(stage, place)
         operation, parents, loss = "enqueued", [], None
@@ -434,10 +436,21 @@ class AuxLossSampler(BaseGASampler):
         storage, trial_id = study._storage, trial._trial_id
         claim = {"stage": stage, "place": place, "attempt": attempt, "seed": evolution.seed, "loss": loss}
         storage.set_trial_system_attr(trial_id, PLACE_KEY, claim)
+        # Enqueued trials, and copies of trials whose worker died, come out of turn. So everybody looks back, and gives way
+        # if he is not alone: one of two, at least, sees the other.
+        self._refresh(study)
+        if self._register.is_shared(trial.number):
+            self._give_back(study, trial)
+            return False
         # For people: what a lineage in the dashboard is made of.
         shown = {"stage": stage, "place": place, "operation": operation, "parents": parents}
         for key, value in shown.items():
             storage.set_trial_user_attr(trial_id, key, value)
+        return True
+
+    def _give_back(self, study: Study, trial: FrozenTrial) -> None:
+        study._storage.set_trial_system_attr(trial._trial_id, PLACE_KEY, None)
+        self._evolution = None  # at the very beginning its seed may differ from the other's
 
     # Evolution.
 

@@ -17,7 +17,7 @@ from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, aulc, read_curve, write_curve
 from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
-from search.config import load_hyperparameters, resolve_env_id
+from search.config import load_aux_loss, load_hyperparameters, resolve_env_id
 
 logger = logging.getLogger(__name__)
 
@@ -177,7 +177,8 @@ def train_and_keep(
     Train with one loss and keep the model, with a progress bar.
 
     :param environment: Id of the environment, or the short form of a DeepMind Control task
-    :param aux_loss: Notation or name, ``"none"`` for none; None for what the file of hyper-parameters says, or ``"auto"``
+    :param aux_loss: Notation, name, or YAML file of ``load_aux_loss``; ``"none"`` for none; None for what the file of
+        hyper-parameters says, or ``"auto"``
     :param config: File of hyper-parameters
     :param environment_steps: Environment steps of the training, None for the file's ``n_timesteps``
     :param n_evaluations: Number of evaluations
@@ -191,6 +192,8 @@ def train_and_keep(
     environment = resolve_env_id(environment)
     hyperparameters = load_hyperparameters(config, environment)
     loss = hyperparameters.get("aux_loss", "auto") if aux_loss is None else aux_loss
+    if isinstance(loss, str) and Path(loss).suffix in (".yml", ".yaml"):
+        loss = load_aux_loss(loss)
     loss = None if loss in (None, "none") else loss if loss == "auto" else catalog.resolve(loss)
     action_repeat = hyperparameters.get("env_kwargs", {}).get("action_repeat", 1)
     if environment_steps is None:
