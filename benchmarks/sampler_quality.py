@@ -10,6 +10,7 @@ the standard deviation of random losses. All objectives look at the canonical fo
 import argparse
 import json
 import multiprocessing
+import os
 import time
 from collections.abc import Callable
 from itertools import combinations
@@ -19,7 +20,6 @@ from typing import Protocol
 import numpy as np
 import optuna
 from scipy.stats import mannwhitneyu
-from threadpoolctl import threadpool_limits
 
 from sb3_aarl.aux_loss import AuxLoss, Token
 from search.provenance import provenance
@@ -164,7 +164,6 @@ def run(cell: tuple[str, str, int, int]) -> dict[str, float | int | str]:
     """One search; the true value of the best of its top five, normalised."""
     objective_name, sampler_name, seed, n_evaluations = cell
     started = time.process_time()
-    threadpool_limits(1)
     objective = OBJECTIVES[objective_name]()
     rng = np.random.default_rng(0)
     at_random = [objective(*_masks(random_loss(rng))) for _ in range(5000)]
@@ -234,6 +233,7 @@ def main() -> None:
     known = {(cell["objective"], cell["sampler"], cell["seed"]) for cell in done}
     wanted = [(o, s, seed) for seed in range(args.seeds) for s in args.samplers for o in args.objectives]
     todo = [(*key, args.evaluations) for key in wanted if key not in known]
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
     # Started anew, not forked: the children of a process with threads would hang now and then.
     with multiprocessing.get_context("spawn").Pool(args.processes) as pool:
         for cell in pool.imap_unordered(run, todo):

@@ -1,0 +1,186 @@
+"""The search space: parameters and back, validity, and the distribution of random losses and of the priors."""
+
+from itertools import product
+
+import numpy as np
+import optuna
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from optuna.distributions import CategoricalDistribution, IntDistribution
+from optuna.samplers import RandomSampler, TPESampler
+from optuna.trial import FixedTrial, TrialState
+from scipy.stats import binomtest, chisquare
+
+from sb3_aarl.aux_loss import OPERATORS, AuxLoss
+from search.space import (
+    check_operators,
+    distributions,
+    forward_dynamics_prior,
+    is_valid,
+    loss_to_params,
+    params_to_loss,
+    random_loss,
+    reward_prediction_prior,
+    suggest_aux_loss,
+)
+
+GENERATORS = {"random": random_loss, "forward dynamics": forward_dynamics_prior, "rewards": reward_prediction_prior}
+
+
+@st.composite
+def losses(draw: st.DrawFn, max_horizon: int = 4, operators: tuple[str, ...] = OPERATORS) -> AuxLoss:
+    """Any valid loss."""
+    horizon = draw(st.integers(1, max_horizon))
+    bits = st.lists(st.booleans(), min_size=3 * horizon + 1, max_size=3 * horizon + 1)
+    source, target = draw(bits.filter(lambda mask: any(mask[::3]))), draw(bits.filter(any))
+    return AuxLoss(horizon, tuple(source), tuple(target), draw(st.sampled_from(operators)), draw(st.booleans()))
+
+
+def test_the_parameters_are_one_boolean_for_each_token_of_the_horizon() -> None:
+    tokens = ["s_t", "a_t", "r_t", "s_t+1", "a_t+1", "r_t+1", "s_t+2"]
+    space = distributions(2, max_horizon=5)
+    assert list(space) == ["horizon", *(f"source/{token}" for token in tokens), *(f"target/{token}" for token in tokens)]
+    assert space["horizon"] == IntDistribution(1, 5)
+    assert all(value == CategoricalDistribution([False, True]) for name, value in space.items() if name != "horizon")
+    searched = distributions(1, operators=("mse", "inner"))
+    assert searched["operator"] == CategoricalDistribution(["mse", "inner"])
+    assert searched["negatives"] == CategoricalDistribution([False, True])
+
+
+@given(losses())
+def test_parameters_and_back(loss: AuxLoss) -> None:
+    params = loss_to_params(loss, OPERATORS)
+    assert params_to_loss(params) == loss
+    assert params_to_loss({**params, "learning_rate": 1.0}) == loss
+    assert set(params) == set(distributions(loss.horizon, operators=OPERATORS))
+    plain = loss_to_params(loss)
+    assert params_to_loss(plain) == AuxLoss(loss.horizon, loss.source, loss.target)
+    assert set(plain) == set(distributions(loss.horizon))
+    assert suggest_aux_loss(FixedTrial(params), operators=OPERATORS) == loss
+    for name in plain:
+        with pytest.raises(KeyError):
+            params_to_loss({key: value for key, value in plain.items() if key != name})
+
+
+def test_valid_is_what_aux_loss_accepts() -> None:
+    n_valid = 0
+    for bits in product([False, True], repeat=8):
+        source, target = bits[:4], bits[4:]
+        try:
+            AuxLoss(1, source, target)
+        except ValueError:
+            assert not is_valid(source, target)
+            assert not is_valid(np.array(source), np.array(target))
+        else:
+            n_valid += 1
+            assert is_valid(source, target)
+            assert is_valid(np.array(source), np.array(target))
+    assert n_valid == 12 * 15
+
+
+def bit_chances(generator: str, source: tuple[bool, ...], target: tuple[bool, ...]) -> list[float]:
+    """The probability of each bit of horizon 1 to be as it is, from the paper's text (A.3)."""
+
+    def chance(bit: bool, p: float) -> float:
+        return p if bit else 1 - p
+
+    if generator == "forward dynamics":
+        chances = [chance(source[0], 0.2), chance(source[3], 0.2), chance(source[1], 0.8), chance(source[2], 0.5)]
+        chances += [float(target[i] != source[i]) for i in (0, 3)]
+        return [*chances, chance(target[1], 0.5), chance(target[2], 0.5)]
+    of_target = [0.0, 0.0, 0.8, 0.0] if generator == "rewards" else [0.5] * 4
+    return [chance(bit, 0.5) for bit in source] + [chance(bit, p) for bit, p in zip(target, of_target, strict=True)]
+
+
+@pytest.mark.parametrize("generator", GENERATORS)
+def test_joint_distribution_of_all_bits_given_that_the_loss_is_valid(generator: str) -> None:
+    rng = np.random.default_rng(0)
+    outcomes = {}
+    for bits in product([False, True], repeat=8):
+        if any(bits[:4:3]) and any(bits[4:]):
+            outcomes[bits[:4], bits[4:]] = float(np.prod(bit_chances(generator, bits[:4], bits[4:])))
+    outcomes = {masks: p / sum(outcomes.values()) for masks, p in outcomes.items() if p > 0}
+    counts = dict.fromkeys(outcomes, 0)
+    for _ in range(20_000):
+        loss = GENERATORS[generator](rng, max_horizon=1)
+        counts[loss.source, loss.target] += 1  # a KeyError here is an outcome that must not be
+    assert chisquare(list(counts.values()), 20_000 * np.array(list(outcomes.values()))).pvalue > 0.001
+
+
+@pytest.mark.parametrize("generator", GENERATORS)
+def test_horizons_are_uniform_and_bits_of_long_losses_have_their_rates(generator: str) -> None:
+    rng = np.random.default_rng(1)
+    drawn = [GENERATORS[generator](rng) for _ in range(6000)]
+    horizons = np.bincount([loss.horizon for loss in drawn], minlength=11)[1:]
+    assert horizons.size == 10
+    assert chisquare(horizons).pvalue > 0.001
+    # Of horizon 8 and more hardly any are rejected: 0.8 ** 9 in the forward-dynamics prior concerns its source states only.
+    masks = np.array([(loss.source[:25], loss.target[:25]) for loss in drawn if loss.horizon >= 8])
+    some_state = 1 - 0.8 ** np.arange(9, 12)
+    rates = {
+        "random": [0.5] * 6,
+        "forward dynamics": [np.mean(0.2 / some_state), 0.8, 0.5, 1 - np.mean(0.2 / some_state), 0.5, 0.5],
+        "rewards": [0.5, 0.5, 0.5, 0, 0, 0.8],
+    }[generator]
+    for side in range(2):
+        for kind in range(3):
+            bits = masks[:, side, kind::3].ravel()
+            assert binomtest(int(bits.sum()), bits.size, rates[3 * side + kind]).pvalue > 0.001, (side, kind)
+
+
+def test_operators_are_drawn_uniformly_with_and_without_negatives() -> None:
+    rng = np.random.default_rng(2)
+    drawn = [random_loss(rng, 2, ("mse", "inner", "cosine")) for _ in range(3000)]
+    counts = [
+        sum(loss.operator == name and loss.negatives == negatives for loss in drawn)
+        for name in ("mse", "inner", "cosine")
+        for negatives in (False, True)
+    ]
+    assert sum(counts) == 3000
+    assert chisquare(counts).pvalue > 0.001
+    assert {(loss.operator, loss.negatives) for loss in (random_loss(rng) for _ in range(50))} == {("mse", False)}
+
+
+@pytest.mark.parametrize("sampler", [RandomSampler(seed=0), TPESampler(seed=0, n_startup_trials=20)])
+@pytest.mark.parametrize("operators", [None, ("mse", "inner")])
+def test_any_sampler_works_and_what_is_invalid_never_reaches_training(
+    sampler: optuna.samplers.BaseSampler, operators: tuple[str, ...] | None
+) -> None:
+    trained = []
+
+    def objective(trial: optuna.Trial) -> float:
+        loss = suggest_aux_loss(trial, 1, operators)
+        trained.append(loss)
+        assert loss == params_to_loss(trial.params)
+        return sum(loss.target)
+
+    study = optuna.create_study(sampler=sampler)
+    study.optimize(objective, n_trials=60)
+    by_state = {
+        state: [trial.params for trial in study.get_trials(states=(state,))]
+        for state in (TrialState.COMPLETE, TrialState.PRUNED)
+    }
+    assert len(by_state[TrialState.COMPLETE]) == len(trained) < 60
+    assert len(by_state[TrialState.PRUNED]) == 60 - len(trained)
+    for params in by_state[TrialState.PRUNED]:
+        is_rejected = not (params["source/s_t"] or params["source/s_t+1"])
+        assert is_rejected or not any(bit for name, bit in params.items() if name.startswith("target/"))
+    assert {loss.operator for loss in trained} == set(operators or ("mse",))
+
+
+@pytest.mark.parametrize("horizon", [0, 4])
+def test_an_enqueued_horizon_outside_of_the_space_is_pruned(horizon: int) -> None:
+    study = optuna.create_study()
+    study.enqueue_trial({"horizon": horizon})
+    with pytest.warns(UserWarning, match="out of range"):
+        study.optimize(lambda trial: suggest_aux_loss(trial, 3).horizon, n_trials=1)
+    assert study.trials[0].state == TrialState.PRUNED
+
+
+@pytest.mark.parametrize(("operators", "culprit"), [(("mse", "l1"), "l1"), ("mse", "mse"), ((), r"\(\)")])
+def test_unknown_operators_are_named(operators: tuple[str, ...] | str, culprit: str) -> None:
+    with pytest.raises(ValueError, match=culprit):
+        check_operators(operators)
+    with pytest.raises(ValueError, match=culprit):
+        suggest_aux_loss(FixedTrial({"horizon": 1}), operators=operators)

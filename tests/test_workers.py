@@ -1,0 +1,98 @@
+"""Who works on a trial, and whether he is alive."""
+
+import os
+import subprocess
+import sys
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import optuna
+import psutil
+import pytest
+from optuna.trial import TrialState, create_trial
+
+from search import workers
+
+
+def sleeper() -> subprocess.Popen[bytes]:
+    """A process that lives until its input is closed."""
+    return subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
+
+
+def test_identity_names_one_process_for_good() -> None:
+    process = sleeper()
+    try:
+        mine, other = workers.identity(), workers.identity(process.pid)
+        assert mine == workers.identity(os.getpid()) != other
+        assert str(os.getpid()) == mine.split()[-2]
+        assert not workers.is_dead(mine)
+        assert not workers.is_dead(other)
+        # The same number, but another start: the number was given to a new process.
+        assert workers.is_dead(f"{other.rsplit(' ', 1)[0]} 1")
+        # Of other machines nothing is known.
+        machine = other.rsplit(" ", 2)[0]
+        assert not workers.is_dead(other.replace(machine, "elsewhere", 1))
+    finally:
+        process.kill()
+        # Dead, but not yet waited for.
+        while psutil.Process(process.pid).status() != psutil.STATUS_ZOMBIE:
+            pass
+        assert workers.is_dead(other)
+        process.communicate()
+    assert workers.is_dead(other)
+    with pytest.raises(psutil.NoSuchProcess):
+        workers.identity(process.pid)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="elsewhere the start is a time of the clock")
+def test_a_change_of_the_clock_kills_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = workers.identity()
+    created = psutil.Process().create_time()
+    monkeypatch.setattr(psutil.Process, "create_time", lambda process: created + 3600)
+    assert workers.identity() == mine
+    assert not workers.is_dead(mine)
+
+
+def test_only_running_trials_of_dead_workers_are_failed() -> None:
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    process = sleeper()
+    dead = workers.identity(process.pid)
+    process.communicate()
+    study = optuna.create_study()
+    for worker in (dead, workers.identity(), None, "elsewhere 1 2"):
+        trial = study.ask()
+        if worker is not None:
+            trial.set_user_attr(workers.WORKER_KEY, worker)
+    study.enqueue_trial({}, user_attrs={workers.WORKER_KEY: dead})
+    study.add_trial(create_trial(value=1.0, user_attrs={workers.WORKER_KEY: dead}))
+    assert workers.fail_dead(study, study.trials) == 1
+    states = [trial.state for trial in study.trials]
+    running = [TrialState.RUNNING] * 3
+    assert states == [TrialState.FAIL, *running, TrialState.WAITING, TrialState.COMPLETE]
+    assert study.trials[0].user_attrs["reason"] == "its worker died"
+    assert workers.fail_dead(study, study.trials) == 0
+
+
+def test_a_copy_of_a_dead_trial_has_time_to_get_the_name_of_its_new_worker() -> None:
+    process = sleeper()
+    dead = workers.identity(process.pid)
+    process.communicate()
+    study = optuna.create_study()
+    for _ in range(2):
+        trial = study.ask()
+        trial.set_user_attr(workers.WORKER_KEY, dead)
+        study._storage.set_trial_system_attr(trial._trial_id, "failed_trial", 0)
+    trials = study.trials
+    trials[1].datetime_start = datetime.now() - timedelta(minutes=1)
+    assert workers.fail_dead(study, trials) == 1
+    assert [trial.state for trial in study.trials] == [TrialState.RUNNING, TrialState.FAIL]
+
+
+def test_failing_a_trial_that_has_finished_changes_nothing() -> None:
+    study = optuna.create_study()
+    trial = study.ask()
+    before = study.trials[0]
+    study.tell(trial, 1.0)
+    assert not workers.fail(study, before, "its worker died")
+    assert study.trials[0].state == TrialState.COMPLETE
+    assert "reason" not in study.trials[0].user_attrs
