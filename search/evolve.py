@@ -1,5 +1,6 @@
 """The evolution (paper, sections 2.2 and 3): a study that worker processes of one machine or many fill stage by stage."""
 
+import logging
 import time
 from collections.abc import Iterator
 from dataclasses import fields
@@ -19,6 +20,8 @@ from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
 from search.storage import open_storage
 from search.trials import loss_of, ranked
+
+logger = logging.getLogger(__name__)
 
 # Candidates that may fail one after the other in one worker: then it is not the losses that are at fault.
 MAX_FAILURES = 10
@@ -87,7 +90,7 @@ def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
     :param folder: Its folder, for checkpoints and curves
     :param where: Its storage, as for ``open_storage``
     """
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # it shows a failed trial with all of its traceback
     sampler = AuxLossSampler(**config.sampler_settings(), worker=workers.identity())
     study = optuna.load_study(
         study_name=study_name(config), storage=open_storage(where), sampler=sampler, pruner=make_pruner(config)
@@ -100,8 +103,10 @@ def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
         nonlocal failures
         annotate_trial(study, trial, artifacts)
         failures = failures + 1 if trial.state == TrialState.FAIL else 0
+        reason = trial.user_attrs.get("reason")
+        if failures:
+            logger.warning("Trial %d failed: %s", trial.number, reason)
         if failures == MAX_FAILURES:
-            reason = trial.user_attrs.get("reason")
             raise ValueError(f"{failures} candidates failed one after the other, the last one: {reason}")
 
     while True:

@@ -157,7 +157,7 @@ def _cell_of(trial: FrozenTrial | optuna.Trial) -> Cell | None:
 
 def _run_worker(grid: Grid, folder: Path, where: str) -> None:
     """Train runs while any is left that no worker has begun."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
     study = optuna.load_study(study_name=grid.name, storage=open_storage(where), sampler=RandomSampler(seed=0))
 
     def objective(trial: optuna.Trial) -> float:

@@ -1,17 +1,47 @@
 """Storages of studies: an embedded journal by default, SQLite and databases by URL."""
 
+import os
 import re
+import sys
 from pathlib import Path
 
 import optuna
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.storages.journal._file import BaseJournalFileLock
+
+if sys.platform != "win32":
+    import fcntl
 
 JOURNAL = "journal.log"
 # Seconds: SQLite's lock is held for milliseconds, but many workers may queue for it.
 SQLITE_TIMEOUT = 120
 # Seconds between the signs of life that a worker leaves in a database (paper-sized trials run for hours).
 HEARTBEAT_INTERVAL = 60
+
+
+class KernelLock(BaseJournalFileLock):
+    """
+    A journal's lock that the operating system frees when its holder dies.
+
+    Optuna's own locks are files: after a SIGKILL the others wait half a minute for them, and with a relative path
+    forever.
+
+    :param path: The lock's file, made if it is not there
+    """
+
+    def __init__(self, path: Path):
+        self._path = path
+
+    def acquire(self) -> bool:
+        """Wait for the lock and take it."""
+        self._descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR)
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        return True
+
+    def release(self) -> None:
+        """Give the lock back."""
+        os.close(self._descriptor)
 
 
 def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
@@ -39,7 +69,9 @@ def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
                 failed_trial_callback=None,
             )
         path.parent.mkdir(parents=True, exist_ok=True)
-        return JournalStorage(JournalFileBackend(str(path)))
+        lock_path = path.with_name(f"{path.name}.lock")
+        lock = JournalFileOpenLock(str(path.absolute())) if sys.platform == "win32" else KernelLock(lock_path)
+        return JournalStorage(JournalFileBackend(str(path), lock))
     except Exception as error:  # whatever a driver raises
         raise ValueError(f"cannot open the storage {without_password(where)}: {without_password(str(error))}") from None
 
