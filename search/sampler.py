@@ -508,6 +508,7 @@ class _Wait:
         self.study = study
         self.trial = trial
         self.delay = 0.001
+        self.queue: list[int] = []
         self.shown = 0.0
         self.signs: dict[int, tuple[Any, float]] = {}
 
@@ -517,6 +518,9 @@ class _Wait:
         :param running: Trials whose places may become free, or whose stage may end
         """
         now = time.monotonic()
+        queue = [other.number for other in ahead]
+        if queue != self.queue:  # it moves: the turn of this trial may be near
+            self.queue, self.delay = queue, 0.001
         for other in ahead:
             sign = other.user_attrs.get(WAITING_KEY)
             if self.signs.get(other.number, (None, 0.0))[0] != sign or other.number not in self.signs:
