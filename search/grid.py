@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import optuna
 import pandas as pd
+from optuna.pruners import NopPruner
 from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, TrialState
 
@@ -90,22 +91,19 @@ def run(grid: Grid, folder: Path, where: str, n_workers: int = 1) -> Iterator[tu
     :raises TrainingError: when runs keep failing; the others were trained
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    sampler = RandomSampler(seed=0)  # draws nothing: all runs are enqueued
     storage = open_storage(where)
-    study = optuna.create_study(
-        study_name=grid.name, storage=storage, sampler=sampler, direction="maximize", load_if_exists=True
-    )
+    study = optuna.create_study(study_name=grid.name, storage=storage, direction="maximize", load_if_exists=True)
     _enqueue(study, grid.cells)
     finished, failed = _count(study, grid.cells)
     yield finished, failed
     while finished < len(grid.cells):
         with WorkerPool(_run_worker, (grid, folder, where), n_workers) as pool:
-            busy = True
+            busy, ended = True, -1
             while busy:
                 time.sleep(POLL_SECONDS)
-                before = finished + failed
+                busy = pool.check(progressed=finished + failed > ended)
+                ended = finished + failed
                 finished, failed = _count(study, grid.cells)
-                busy = pool.check(progressed=finished + failed > before)
                 yield finished, failed
         if not _enqueue(study, grid.cells) and finished < len(grid.cells):
             reasons = [trial.user_attrs.get("reason") for trial in study.get_trials(deepcopy=False, states=(TrialState.FAIL,))]
@@ -158,7 +156,10 @@ def _cell_of(trial: FrozenTrial | optuna.Trial) -> Cell | None:
 def _run_worker(grid: Grid, folder: Path, where: str) -> None:
     """Train runs while any is left that no worker has begun."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    study = optuna.load_study(study_name=grid.name, storage=open_storage(where), sampler=RandomSampler(seed=0))
+    # Nothing is sampled, all runs are enqueued; and none is pruned, as Optuna's default would.
+    study = optuna.load_study(
+        study_name=grid.name, storage=open_storage(where), sampler=RandomSampler(seed=0), pruner=NopPruner()
+    )
 
     def objective(trial: optuna.Trial) -> float:
         cell = _cell_of(trial)

@@ -3,9 +3,11 @@
 import os
 import re
 import sys
+import warnings
 from pathlib import Path
 
 import optuna
+from optuna.exceptions import ExperimentalWarning
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.storages.journal._file import BaseJournalFileLock
@@ -62,12 +64,11 @@ def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
     try:
         if "://" in where:
             connect_args = {"timeout": SQLITE_TIMEOUT} if where.startswith("sqlite") else {}
-            return RDBStorage(
-                where,
-                engine_kwargs={"connect_args": connect_args},
-                heartbeat_interval=HEARTBEAT_INTERVAL,
-                failed_trial_callback=None,
-            )
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ExperimentalWarning)  # heartbeats are, says Optuna
+                return RDBStorage(
+                    where, engine_kwargs={"connect_args": connect_args}, heartbeat_interval=HEARTBEAT_INTERVAL
+                )
         path.parent.mkdir(parents=True, exist_ok=True)
         lock_path = path.with_name(f"{path.name}.lock")
         lock = JournalFileOpenLock(str(path.absolute())) if sys.platform == "win32" else KernelLock(lock_path)
