@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from datetime import datetime, timedelta
-from pathlib import Path
 
 import optuna
 import psutil
@@ -44,7 +43,6 @@ def test_identity_names_one_process_for_good() -> None:
         workers.identity(process.pid)
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="elsewhere the start is a time of the clock")
 def test_a_change_of_the_clock_kills_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     mine = workers.identity()
     created = psutil.Process().create_time()
