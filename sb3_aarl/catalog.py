@@ -64,7 +64,7 @@ def load(name: str) -> AuxLoss:
     try:
         return _named()[name]
     except (KeyError, TypeError):
-        nearest = difflib.get_close_matches(str(name), names(), cutoff=0.4)
+        nearest = difflib.get_close_matches(str(name).lower(), names(), cutoff=0.4)
         hint = f"nearest: {', '.join(nearest)}" if nearest else f"known: {', '.join(names())}"
         raise ValueError(f"unknown auxiliary loss {name!r}, {hint}") from None
 

@@ -62,7 +62,7 @@ class SACAux(SAC):
     :param use_sde_at_warmup: As in SB3
     :param stats_window_size: As in SB3
     :param tensorboard_log: As in SB3
-    :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``
+    :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``; where it names ``augmentation`` or ``crop_size``, they win
     :param verbose: 0 no output, 1 info, 2 debug
     :param seed: Seed of the pseudo random generators
     :param device: Device of the networks
@@ -174,7 +174,7 @@ class SACAux(SAC):
             device,
             _init_setup_model=False,
         )
-        self.aux_loss = aux_loss if aux_loss in (None, "auto") else catalog.resolve(aux_loss)
+        self.aux_loss = aux_loss
         self.aux_coef = aux_coef
         self.aux_batch_size = aux_batch_size
         self.encoder_tau = encoder_tau
@@ -197,6 +197,9 @@ class SACAux(SAC):
             self._setup_model()
 
     def _setup_model(self) -> None:
+        # Here rather than in the constructor: load() takes these arguments too, and replaces attributes by them.
+        if self.aux_loss is not None and self.aux_loss != "auto":
+            self.aux_loss = catalog.resolve(self.aux_loss)
         # What each argument is called, in case that one of them does not fit.
         for name in ("policy_delay", "target_update_interval", "crop_size", "aux_batch_size", "predictor_width"):
             if getattr(self, name) is not None and not getattr(self, name) >= 1:
@@ -214,7 +217,7 @@ class SACAux(SAC):
             self.replay_buffer_class = None
             self.replay_buffer = self.replay_buffer or self._make_replay_buffer()
         policy_kwargs = self.policy_kwargs
-        self.policy_kwargs = {**policy_kwargs, "augmentation": self.augmentation, "crop_size": self.crop_size}
+        self.policy_kwargs = {"augmentation": self.augmentation, "crop_size": self.crop_size, **policy_kwargs}
         super()._setup_model()
         self.policy_kwargs = policy_kwargs
         if own_buffer:
@@ -304,8 +307,7 @@ class SACAux(SAC):
 
         def log(name: str, value: th.Tensor) -> None:
             if not th.isfinite(value).all():
-                step = f"gradient step {self._n_updates}, agent step {self.num_timesteps}"
-                raise NonFiniteError(f"{name} is {value.item()} at {step}; auxiliary loss: {self.aux_loss}")
+                raise NonFiniteError(f"{name} is {value.item()} at {self._step_and_loss()}")
             losses.setdefault(name, []).append(value.item())
 
         for _ in range(gradient_steps):
@@ -450,6 +452,9 @@ class SACAux(SAC):
                 self._check_finite("terminal observation", info["terminal_observation"])
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
 
+    def _step_and_loss(self) -> str:
+        return f"gradient step {self._n_updates}, agent step {self.num_timesteps}; auxiliary loss: {self.aux_loss}"
+
     def _check_finite(self, name: str, values: np.ndarray | dict[str, np.ndarray]) -> None:
         for key, array in values.items() if isinstance(values, dict) else [("", values)]:
             if np.issubdtype(np.asarray(array).dtype, np.floating) and not np.isfinite(array).all():
@@ -477,7 +482,14 @@ class SACAux(SAC):
         if self._random_state is not None and not reset_num_timesteps:
             self._set_random_state(self._random_state)
         self._random_state = None
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        try:
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        except ValueError as error:
+            # PyTorch refuses actions that are NaN before any loss is; it knows neither the step nor the cause.
+            culprit = None if isinstance(error, NonFiniteError) else self._non_finite_parameter()
+            if culprit is None:
+                raise
+            raise NonFiniteError(f"{culprit} is not finite at {self._step_and_loss()}") from error
 
     def _get_random_state(self) -> dict[str, Any]:
         return {
@@ -512,16 +524,23 @@ class SACAux(SAC):
         :param include: Attributes that are put in although they are usually left out
         :raises NonFiniteError: when a parameter is NaN or infinite; what is at ``path`` stays as it is
         """
-        variables = {name: getattr(self, name) for name in self._get_torch_save_params()[1]}
-        for name, parameters in {**self.get_parameters(), "model": variables}.items():
-            for key, value in parameters.items():
-                if isinstance(value, th.Tensor) and not th.isfinite(value).all():
-                    raise NonFiniteError(f"{name}.{key} is not finite: the model is not saved to {path}")
+        culprit = self._non_finite_parameter()
+        if culprit is not None:
+            raise NonFiniteError(f"{culprit} is not finite: the model is not saved to {path}")
         self._random_state = self._get_random_state()
         try:
             super().save(path, exclude, include)
         finally:
             self._random_state = None
+
+    def _non_finite_parameter(self) -> str | None:
+        """The name of a parameter that is NaN or infinite, if there is one."""
+        variables = {name: getattr(self, name) for name in self._get_torch_save_params()[1]}
+        for name, parameters in {**self.get_parameters(), "model": variables}.items():
+            for key, value in parameters.items():
+                if isinstance(value, th.Tensor) and not th.isfinite(value).all():
+                    return f"{name}.{key}"
+        return None
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "ent_coef_schedule", "encoder_schedule"]

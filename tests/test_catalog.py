@@ -68,6 +68,7 @@ def test_names() -> None:
     "name, nearest",
     [
         ("crul", "curl"),
+        ("CURL", "curl"),
         ("forward-dynamic", "forward-dynamics"),
         ("aarl_pixel", "aarl-pixel"),
         ("spr-11", "spr-1"),
