@@ -6,6 +6,7 @@ import difflib
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -98,7 +99,7 @@ def make_dmc_env(
     ``env.reset(seed=s)`` makes all that follows repeatable. Rewards of repeated steps are summed; an episode has 1000
     simulator steps ("environment steps" in the paper), so 1000 / action_repeat agent steps, and ends by truncation.
 
-    :param env_id: Such as ``dm_control/cheetah-run-v0``; ``cheetah-run`` will do
+    :param env_id: Such as ``dm_control/cheetah-run-v0``; ``cheetah-run`` and the paper's ``Cheetah-Run`` will do
     :param pixels: Whether to observe rendered images, (3 * frame_stack, height, width) bytes, instead of state vectors
     :param action_repeat: Simulator steps for which each action is kept
     :param frame_stack: Consecutive observations put side by side, the newest last; the first one of an episode fills up
@@ -111,13 +112,15 @@ def make_dmc_env(
     """
     known = env_ids()
     if env_id not in known:
-        full = f"{PREFIX}{env_id.removeprefix(PREFIX).removesuffix('-v0')}-v0"
+        full = f"{PREFIX}{env_id.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
         if full not in known:
             nearest = ", ".join(difflib.get_close_matches(full, known, cutoff=0.4)) or f"something like {known[0]}"
             raise ValueError(f"unknown DeepMind Control task {env_id!r}, nearest: {nearest}")
         env_id = full
     domain = env_id.removeprefix(PREFIX).partition("-")[0]
-    height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
+    height, width = image_size if isinstance(image_size, Sequence) else (image_size, image_size)
+    if min(height, width) < 1:
+        raise ValueError(f"image_size must be at least 1, not {image_size}")
     render_kwargs: dict[str, Any] = {"height": height, "width": width}
     render_kwargs["camera_id"] = CAMERAS.get(domain, 0) if camera_id is None else camera_id
     if fast_rendering:

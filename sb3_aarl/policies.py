@@ -16,6 +16,7 @@ from sb3_aarl.augmentation import center_crop, random_crop, random_shift
 from sb3_aarl.encoders import DenseMLP, Encoder, MultiInputEncoder, PixelEncoder, encoder_class, orthogonal_init
 
 AUGMENTATIONS = ("auto", "random_crop", "random_shift", "none")
+CROP_SIZE = 84  # paper, table 7
 
 
 class _CropsImages:
@@ -164,8 +165,9 @@ class SACAuxPolicy(SACPolicy):
     :param share_features_extractor: True (default, CURL's pixel agent): the actor reads the critic's encoder
         detached, through a projection of its own. False: it has an encoder of its own, which the actor loss trains
     :param augmentation: What ``augment`` does to images: ``random_crop``, ``random_shift``, ``none``, or ``auto``:
-        crop what is larger than ``crop_size``, shift what is not
-    :param crop_size: Height and width in pixels of cropped images (paper, table 7: 84)
+        crop if all images are larger than ``crop_size``, shift if not
+    :param crop_size: Height and width in pixels of cropped images, None for 84 (paper, table 7). Where it is given,
+        images must not be smaller
     :param squash_log_std: None (default, SB3): the log standard deviation is clipped to [-20, 2]. Bounds such as
         (-10, 2) (the public reference): tanh squashes it into them; gSDE, whose scale is no network's, ignores them
     :param ortho_init: Whether the hidden layers of actor and critic start orthogonal with zero biases (CURL, the
@@ -190,13 +192,13 @@ class SACAuxPolicy(SACPolicy):
         features_extractor_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = True,
         augmentation: str = "auto",
-        crop_size: int = 84,
+        crop_size: int | None = None,
         squash_log_std: tuple[float, float] | None = None,
         ortho_init: bool = False,
         **kwargs: Any,
     ):
         self.augmentation = resolve_augmentation(augmentation, observation_space, crop_size)
-        self.crop_size = crop_size
+        self.crop_size = CROP_SIZE if crop_size is None else crop_size
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
         encoder = encoder_class(features_extractor_class or self.default_encoder)
@@ -328,13 +330,13 @@ def cropped_space(space: spaces.Space, size: int) -> spaces.Space:
     return cropped.get("", space)
 
 
-def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int) -> str:
+def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int | None) -> str:
     """
     What ``augmentation`` means for these observations.
 
     :param augmentation: One of ``AUGMENTATIONS``
     :param space: Observation space, images channel first
-    :param crop_size: Height and width in pixels of cropped images
+    :param crop_size: Height and width in pixels of cropped images, None for 84 if images are larger
     :return: ``random_crop``, ``random_shift`` or ``none``
     :raises ValueError: for an unknown name, and for images that are smaller than the crop
     """
@@ -343,12 +345,14 @@ def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int)
     sizes = {key: box.shape[1:] for key, box in image_spaces(space).items()}
     if not sizes:
         return "none"
-    if augmentation == "auto":
-        return "random_crop" if min(map(min, sizes.values())) > crop_size else "random_shift"
+    needs_crop = augmentation == "random_crop" or (augmentation == "auto" and crop_size is not None)
+    crop_size = CROP_SIZE if crop_size is None else crop_size
     for key, size in sizes.items():
-        if augmentation == "random_crop" and min(size) < crop_size:
+        if needs_crop and min(size) < crop_size:
             raise ValueError(
                 f"images{f' under {key!r}' if key else ''} of {size[0]} x {size[1]} pixels are smaller than the crop of "
                 f"{crop_size} x {crop_size}: render them larger, or ask for augmentation='random_shift'"
             )
+    if augmentation == "auto":
+        return "random_crop" if min(map(min, sizes.values())) > crop_size else "random_shift"
     return augmentation

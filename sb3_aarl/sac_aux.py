@@ -84,9 +84,9 @@ class SACAux(SAC):
     :param ent_coef_learning_rate: Of the entropy coefficient, may be a schedule; None for ``learning_rate`` (SB3)
     :param ent_coef_betas: Adam's betas for the entropy coefficient (SB3: (0.9, 0.999))
     :param augmentation: ``"random_crop"`` to ``crop_size`` in training with a centre crop elsewhere,
-        ``"random_shift"`` by up to 4 pixels, ``"none"``; ``"auto"`` crops what is larger than ``crop_size`` and shifts
-        what is not. Vectors are never augmented
-    :param crop_size: Height and width in pixels of cropped images
+        ``"random_shift"`` by up to 4 pixels, ``"none"``; ``"auto"`` crops if all images are larger than ``crop_size``
+        and shifts if not. Vectors are never augmented
+    :param crop_size: Height and width in pixels of cropped images, None for 84. Where it is given, images must not be smaller
     :raises ValueError: for arguments that do not fit, with the culprit's name
     """
 
@@ -141,7 +141,7 @@ class SACAux(SAC):
         ent_coef_learning_rate: float | Schedule | None = 1e-4,
         ent_coef_betas: tuple[float, float] = (0.5, 0.999),
         augmentation: str = "auto",
-        crop_size: int = 84,
+        crop_size: int | None = None,
         _init_setup_model: bool = True,
     ):
         super().__init__(
@@ -354,14 +354,14 @@ class SACAux(SAC):
             log("critic_loss", critic_loss)
             self.critic.optimizer.zero_grad()
             if self.joint_optimizer and self.aux_optimizer is not None:
-                self._backward_aux_loss(log)
+                self._backward_aux_loss(log, batch_size)
                 critic_loss.backward()  # adds to the encoder's gradient
                 self.critic.optimizer.step()
                 self.aux_optimizer.step()
             else:
                 critic_loss.backward()
                 self.critic.optimizer.step()
-                if self._backward_aux_loss(log):
+                if self._backward_aux_loss(log, batch_size):
                     assert self.aux_optimizer is not None
                     self.aux_optimizer.step()
 
@@ -385,11 +385,12 @@ class SACAux(SAC):
         for name, values in losses.items():
             self.logger.record(f"train/{name}", np.mean(values))
 
-    def _backward_aux_loss(self, log: Any) -> bool:
+    def _backward_aux_loss(self, log: Any, batch_size: int) -> bool:
         """
         Leave the gradient of the auxiliary loss, and nothing else, on encoder and head.
 
         :param log: Function of a name and a scalar
+        :param batch_size: Windows to draw, unless ``aux_batch_size`` is given
         :return: False if there is no auxiliary loss, or no episode is as long as its horizon yet
         """
         if self.aux_head is None:
@@ -399,7 +400,7 @@ class SACAux(SAC):
         horizon, offsets = self.aux_head.loss.horizon, self.aux_head.offsets
         try:
             windows = self.replay_buffer.sample_windows(
-                self.aux_batch_size or self.batch_size, horizon, env=self._vec_normalize_env, offsets=offsets
+                self.aux_batch_size or batch_size, horizon, env=self._vec_normalize_env, offsets=offsets
             )
         except NoWindowError:
             self._n_aux_skipped += 1
@@ -544,6 +545,24 @@ class SACAux(SAC):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "ent_coef_schedule", "encoder_schedule"]
+
+    def set_parameters(
+        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        As in SB3.
+
+        :param load_path_or_dict: Path of a saved model, or what ``get_parameters`` gave
+        :param exact_match: Whether all parameters must be there, and no others
+        :param device: Device of the parameters
+        :raises ValueError: when one model has an auxiliary loss and the other has none
+        """
+        if isinstance(load_path_or_dict, dict) and ("aux_head" in load_path_or_dict) > (self.aux_head is not None):
+            raise ValueError(
+                "these parameters are of a model with an auxiliary loss, this one has none: load it with its own, and make a "
+                "new model with aux_loss=None to train without"
+            )
+        super().set_parameters(load_path_or_dict, exact_match, device)  # type: ignore[arg-type]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -78,7 +78,7 @@ def test_table_7_during_evolution(task: str, repeat: int) -> None:
     assert load_hyperparameters(path, env_id)["buffer_size"] == 100_000
     model = build(path, env_id)
     assert model.observation_space == gym.spaces.Box(0, 255, (3 * 3, 100, 100), np.uint8)
-    assert model.policy.augmentation == "random_crop" and model.crop_size == 84
+    assert model.policy.augmentation == "random_crop" and model.policy.crop_size == 84
     assert model.learning_starts == 1000
     assert model.get_env().get_attr("num_repeats") == [repeat]
     assert model.policy_kwargs["net_arch"] == [1024, 1024]

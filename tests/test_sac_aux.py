@@ -827,6 +827,7 @@ def test_policy_kwargs_name_the_augmentation_too(argument: dict[str, Any], tmp_p
         ("state", {"aux_coef": float("inf")}, r"aux_coef must be a finite number"),
         ("state", {"augmentation": "flip"}, r"unknown augmentation 'flip', expected one of auto, random_crop"),
         ("pixels", {"augmentation": "random_crop", "crop_size": 19}, r"18 x 20 pixels are smaller than the crop of 19 x 19"),
+        ("pixels", {"crop_size": 19}, r"18 x 20 pixels are smaller than the crop of 19 x 19"),
         ("dict", {"augmentation": "random_crop", "crop_size": 19}, r"under 'image' of 18 x 20 pixels are smaller"),
         ("pixels", {"replay_buffer_kwargs": {"frame_stack": 2}}, r"frame_stack=2 does not divide the first axis"),
         ("state", {"policy_kwargs": {"features_extractor_class": "pixle"}}, r"unknown encoder 'pixle', expected one of"),
@@ -842,6 +843,12 @@ def test_policy_kwargs_name_the_augmentation_too(argument: dict[str, Any], tmp_p
 def test_bad_arguments(kind: str, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_model(kind, **settings)
+
+
+def test_loading_without_the_auxiliary_loss_says_what_is_wrong(tmp_path: pathlib.Path) -> None:
+    make_model("state").save(tmp_path / "model")
+    with pytest.raises(ValueError, match="of a model with an auxiliary loss"):
+        SACAux.load(tmp_path / "model", aux_loss=None)
 
 
 def test_her_says_so_with_the_default_loss_and_trains_without() -> None:
