@@ -555,10 +555,11 @@ class SACAux(SAC):
         :param load_path_or_dict: Path of a saved model, or what ``get_parameters`` gave
         :param exact_match: Whether all parameters must be there, and no others
         :param device: Device of the parameters
-        :raises ValueError: when one model has an auxiliary loss and the other has none
+        :raises RuntimeError: when they hold an auxiliary loss and this model has none
         """
         if isinstance(load_path_or_dict, dict) and ("aux_head" in load_path_or_dict) > (self.aux_head is not None):
-            raise ValueError(
+            # Not a ValueError, which SB3's load() takes for a DQN of an old version.
+            raise RuntimeError(
                 "these parameters are of a model with an auxiliary loss, this one has none: load it with its own, and make a "
                 "new model with aux_loss=None to train without"
             )

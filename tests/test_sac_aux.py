@@ -847,7 +847,7 @@ def test_bad_arguments(kind: str, settings: dict[str, Any], message: str) -> Non
 
 def test_loading_without_the_auxiliary_loss_says_what_is_wrong(tmp_path: pathlib.Path) -> None:
     make_model("state").save(tmp_path / "model")
-    with pytest.raises(ValueError, match="of a model with an auxiliary loss"):
+    with pytest.raises(RuntimeError, match="of a model with an auxiliary loss"):
         SACAux.load(tmp_path / "model", aux_loss=None)
 
 
