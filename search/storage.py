@@ -66,9 +66,7 @@ def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
             connect_args = {"timeout": SQLITE_TIMEOUT} if where.startswith("sqlite") else {}
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)  # heartbeats are, says Optuna
-                return RDBStorage(
-                    where, engine_kwargs={"connect_args": connect_args}, heartbeat_interval=HEARTBEAT_INTERVAL
-                )
+                return RDBStorage(where, engine_kwargs={"connect_args": connect_args}, heartbeat_interval=HEARTBEAT_INTERVAL)
         path.parent.mkdir(parents=True, exist_ok=True)
         lock_path = path.with_name(f"{path.name}.lock")
         lock = JournalFileOpenLock(str(path.absolute())) if sys.platform == "win32" else KernelLock(lock_path)
