@@ -68,6 +68,11 @@ class Point(gym.Env):
         return self.observe(), -float(np.square(self.point).sum()), terminated, self.steps >= self.length, {}
 
 
+def name(value: object) -> str:
+    """A test's id: without addresses of functions, which differ among pytest's processes."""
+    return str(value).partition(" at 0x")[0]
+
+
 def make_env(kind: str, n_envs: int = 1, length: int = 15) -> DummyVecEnv:
     return DummyVecEnv([lambda: Point(kind, length)] * n_envs)
 
@@ -139,7 +144,7 @@ def pendulum(n_envs: int) -> DummyVecEnv:
         (1, {"train_freq": 4, "gradient_steps": 3, "ent_coef": "auto_0.5", "target_entropy": -2.0}),
         (1, {"policy_kwargs": {"net_arch": {"pi": [12], "qf": [20, 8]}, "n_critics": 3, "activation_fn": th.nn.Tanh}}),
     ],
-    ids=str,
+    ids=name,
 )
 def test_without_aux_loss_is_sac(n_envs: int, settings: dict[str, Any]) -> None:
     both: dict[str, Any] = {
@@ -465,7 +470,7 @@ def moved_by_train(model: SACAux, gradient_steps: int = 1) -> set[str]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("settings", [{}, {"joint_optimizer": True}, {"predictor_batch_norm": True}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"joint_optimizer": True}, {"predictor_batch_norm": True}], ids=name)
 def test_what_a_step_moves(kind: str, settings: dict[str, Any]) -> None:
     model = filled_model(kind, policy_delay=3, target_update_interval=2, **settings)
     every = {"encoder", "q", "head"}
@@ -838,7 +843,7 @@ def test_policy_kwargs_name_the_augmentation_too(argument: dict[str, Any], tmp_p
         ),
         ("dict", {"replay_buffer_class": HerReplayBuffer}, r"HerReplayBuffer cannot be used with an auxiliary loss"),
     ],
-    ids=str,
+    ids=name,
 )
 def test_bad_arguments(kind: str, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
