@@ -23,6 +23,7 @@ def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, 
     """What a worker process runs."""
     import torch as th
 
+    signal.signal(signal.SIGINT, _interrupt_once)
     th.set_num_threads(threads)
     threading.Thread(target=_stop_with_parent, args=(os.getppid(),), daemon=True).start()
     try:
@@ -32,6 +33,12 @@ def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, 
     except Exception as error:
         errors.put(f"{error}" if isinstance(error, ValueError) else traceback.format_exc())
         os._exit(1)
+
+
+def _interrupt_once(signum: int, frame: Any) -> None:
+    """A terminal's Ctrl-C reaches a worker twice, from the pool too: the second must not disturb its putting away."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 def _stop_with_parent(parent: int) -> None:

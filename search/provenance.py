@@ -10,6 +10,8 @@ from pathlib import Path
 
 import torch as th
 
+from search.storage import without_password
+
 PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "shimmy", "optuna", "numpy")
 
 
@@ -47,7 +49,8 @@ def provenance() -> dict[str, str]:
             continue
     return {
         "commit": commit(),
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        # It stands in notes and reports, which others read.
+        "command": without_password(" ".join([Path(sys.argv[0]).name, *sys.argv[1:]])),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "cpu": cpu(),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else "none",

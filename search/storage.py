@@ -1,16 +1,18 @@
 """Storages of studies: an embedded journal by default, SQLite and databases by URL."""
 
+import json
 import os
 import re
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import optuna
 from optuna.exceptions import ExperimentalWarning
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
-from optuna.storages.journal._file import BaseJournalFileLock
+from optuna.storages.journal._file import BaseJournalFileLock, get_lock_file
 
 if sys.platform != "win32":
     import fcntl
@@ -37,13 +39,48 @@ class KernelLock(BaseJournalFileLock):
 
     def acquire(self) -> bool:
         """Wait for the lock and take it."""
-        self._descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR)
-        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except BaseException:  # Ctrl-C
+            os.close(descriptor)
+            raise
+        self._descriptor = descriptor
         return True
 
     def release(self) -> None:
         """Give the lock back."""
         os.close(self._descriptor)
+
+
+class JournalFile(JournalFileBackend):
+    """
+    A journal that survives a line cut short, which a SIGKILL or a full disk leaves in the middle of a long one.
+
+    Optuna would write its next line behind the rest of that one, and never read the file again.
+
+    :param path: The file
+    :param lock: Its lock
+    """
+
+    def __init__(self, path: Path, lock: BaseJournalFileLock):
+        super().__init__(str(path), lock)
+        self._path = path
+        self._file_lock = lock
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """Cut off what was never finished, then write."""
+        lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
+        with get_lock_file(self._file_lock), self._path.open("rb+") as file:
+            if file.seek(0, os.SEEK_END) > 0:
+                file.seek(-1, os.SEEK_END)
+                if file.read(1) != b"\n":
+                    file.seek(0)
+                    file.truncate(file.read().rfind(b"\n") + 1)
+                    file.seek(0, os.SEEK_END)
+            file.write(lines.encode())
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
@@ -70,7 +107,7 @@ def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock_path = path.with_name(f"{path.name}.lock")
         lock = JournalFileOpenLock(str(path.absolute())) if sys.platform == "win32" else KernelLock(lock_path)
-        return JournalStorage(JournalFileBackend(str(path), lock))
+        return JournalStorage(JournalFile(path, lock))
     except Exception as error:  # whatever a driver raises
         raise ValueError(f"cannot open the storage {without_password(where)}: {without_password(str(error))}") from None
 
@@ -80,7 +117,8 @@ def without_password(text: str) -> str:
     :param text: A URL, or a message with URLs in it
     :return: The same with the passwords replaced by ``***``
     """
-    return re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", text)
+    text = re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", text)
+    return re.sub(r"([?&](?:password|passwd|pwd)=)[^&\s]*", r"\1***", text)
 
 
 def load_study(storage: BaseStorage, name: str | None = None) -> optuna.Study:

@@ -1,0 +1,43 @@
+"""Worker processes: Ctrl-C."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from search.pool import WorkerPool
+
+
+def put_away(folder: Path) -> None:
+    """A worker that takes a while to put away what it has."""
+    try:
+        (folder / "ready").touch()
+        while True:
+            time.sleep(0.01)
+    except KeyboardInterrupt:
+        (folder / "interrupted").touch()
+        while not (folder / "twice").exists():
+            time.sleep(0.01)
+        (folder / "away").touch()
+        raise
+
+
+def wait_for(path: Path) -> None:
+    deadline = time.monotonic() + 60
+    while not path.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_a_second_interrupt_does_not_disturb_a_worker_that_puts_away_what_it_has(tmp_path: Path) -> None:
+    """A terminal interrupts the workers along with the program, and then the pool does."""
+    with WorkerPool(put_away, (tmp_path,), n_workers=1) as pool:
+        (worker,) = pool.processes
+        wait_for(tmp_path / "ready")
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGINT)
+        wait_for(tmp_path / "interrupted")
+        os.kill(worker.pid, signal.SIGINT)
+        (tmp_path / "twice").touch()
+    assert (tmp_path / "away").exists()
+    assert worker.exitcode == 128 + signal.SIGINT
