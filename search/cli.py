@@ -147,7 +147,8 @@ def search(
                 shown = progress
         if shown is not None and shown.best is not None:
             console.print(f"Best so far: {shown.best_loss}, score {shown.best:.2f}", markup=False, soft_wrap=True)
-        console.print(f"To watch it: aarl dashboard {path}", markup=False, soft_wrap=True)
+        option = "" if storage is None else f" --storage {without_password(storage)}"
+        console.print(f"To watch it: aarl dashboard {path}{option}", markup=False, soft_wrap=True)
 
 
 @contextlib.contextmanager
@@ -188,7 +189,7 @@ def _train_grid(grid: "Grid", folder: Path, storage: str | None, workers: int) -
         task = bar.add_task(grid.name, total=n_runs)
         for finished, failed in grids.run(grid, folder, where, workers):
             bar.update(task, completed=finished, description=f"{grid.name}, {failed} failed" if failed else grid.name)
-    return grids.scores(load_study(open_storage(where, create=False), grid.name))
+    return grids.scores(load_study(open_storage(where, create=False), grid.name), grid.cells)
 
 
 def _show(frame: "pd.DataFrame", title: str) -> None:
@@ -250,7 +251,7 @@ def cross_validate(
         searched = load_study(open_storage(storage or str(path), create=False), study or config.stem)
         grid = cross_validation.make_grid(settings, searched, top)
         runs = _train_grid(grid, path, storage, workers)
-        table = cross_validation.ranking(runs[runs["variant"].isin(grid.variants)])
+        table = cross_validation.ranking(runs)
         _show(table, "Cross-validation, AULC")
         winner = cross_validation.write_winner(table, path / "winner.yml")
         console.print(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}", markup=False, soft_wrap=True, highlight=False)

@@ -105,22 +105,32 @@ def run(grid: Grid, folder: Path, where: str, n_workers: int = 1) -> Iterator[tu
                 ended = finished + failed
                 finished, failed = _count(study, grid.cells)
                 yield finished, failed
-        if not _enqueue(study, grid.cells) and finished < len(grid.cells):
-            reasons = [trial.user_attrs.get("reason") for trial in study.get_trials(deepcopy=False, states=(TrialState.FAIL,))]
-            raise TrainingError(f"{len(grid.cells) - finished} runs failed {MAX_TRIES} times; the last reason: {reasons[-1]}")
+        while not _enqueue(study, grid.cells):
+            running = study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.WAITING))
+            finished, failed = _count(study, grid.cells)  # after that: none of these is overlooked
+            yield finished, failed
+            if finished == len(grid.cells):
+                return
+            if not running:
+                failures = study.get_trials(deepcopy=False, states=(TrialState.FAIL,))
+                reasons = [trial.user_attrs.get("reason") for trial in failures if _cell_of(trial) in grid.cells]
+                missing = len(grid.cells) - finished
+                raise TrainingError(f"{missing} runs failed {MAX_TRIES} times; the last reason: {reasons[-1]}")
+            time.sleep(POLL_SECONDS)  # the same command runs elsewhere too, and has the last runs
 
 
-def scores(study: optuna.Study) -> pd.DataFrame:
+def scores(study: optuna.Study, cells: Sequence[Cell]) -> pd.DataFrame:
     """
     What a grid's study has finished: one row a run with ``variant``, ``environment``, ``seed``, ``score`` (AULC) and
     ``last`` (mean return at the last checkpoint).
 
     :param study: The study
+    :param cells: Runs of the grid; the study may have others, of an earlier version of the configuration
     """
     rows = []
     for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
         cell = _cell_of(trial)
-        if cell is not None:
+        if cell is not None and cell in cells:
             rows.append({**cell._asdict(), "score": trial.value, "last": trial.user_attrs["curve"][-1][1]})
     columns = [*Cell._fields, "score", "last"]
     return pd.DataFrame(rows, columns=columns).drop_duplicates(list(Cell._fields))
@@ -130,7 +140,7 @@ def _enqueue(study: optuna.Study, cells: Sequence[Cell]) -> int:
     """Enqueue the runs that nobody has or had, and those that did not fail too often; how many."""
     workers.fail_dead(study, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
     trials = study.get_trials(deepcopy=False)
-    there = {_cell_of(trial) for trial in trials if trial.state != TrialState.FAIL}
+    there = {_cell_of(trial) for trial in trials if trial.state not in (TrialState.FAIL, TrialState.PRUNED)}
     failures = Counter(
         _cell_of(trial) for trial in trials if trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted")
     )
@@ -165,6 +175,8 @@ def _run_worker(grid: Grid, folder: Path, where: str) -> None:
         cell = _cell_of(trial)
         if cell is None:
             raise optuna.TrialPruned("another worker took the last run")
+        if cell not in grid.cells:
+            raise optuna.TrialPruned("enqueued by a grid that was interrupted, and not part of this one")
         trial.set_user_attr(workers.WORKER_KEY, workers.identity())
         variant = grid.variants[cell.variant]
         # A folder of its own: two variants may have one loss.

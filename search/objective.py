@@ -1,7 +1,8 @@
 """The objective of a search: train one candidate, report its learning curve, return the area under it (AULC)."""
 
+import contextlib
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,9 @@ class Objective:
         :raises optuna.TrialPruned: for an invalid candidate, before anything is trained, and for a pruned one
         :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
         """
-        loss = suggest_aux_loss(trial, self.config.max_horizon, self.config.operators)
-        return self.train(trial, loss, self.config.environment, self.config.seeds)
+        with _interruptions_noted(trial):
+            loss = suggest_aux_loss(trial, self.config.max_horizon, self.config.operators)
+            return self._train(trial, loss, self.config.environment, self.config.seeds, {})
 
     def train(
         self,
@@ -77,6 +79,17 @@ class Objective:
         :raises optuna.TrialPruned: when the pruner says so
         :raises CandidateFailed: as above
         """
+        with _interruptions_noted(trial):
+            return self._train(trial, aux_loss, environment, seeds, overrides or {})
+
+    def _train(
+        self,
+        trial: optuna.Trial,
+        aux_loss: AuxLoss | None,
+        environment: str,
+        seeds: Sequence[int],
+        overrides: Mapping[str, Any],
+    ) -> float:
         config = self.config
         hyperparameters = config.hyperparameters_for(environment, overrides)
         checkpoints = config.checkpoints_for(environment)
@@ -123,14 +136,21 @@ class Objective:
             reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
             trial.set_user_attr("reason", reason)
             raise CandidateFailed(reason) from error
-        except KeyboardInterrupt:
-            trial.set_user_attr("interrupted", True)
-            raise
         trial.set_user_attr("curve", mean_curve(curves))
         trial.set_user_attr("seconds", round(sum(curve[-1].seconds for curve in curves), 1))
         if pruned:
             raise optuna.TrialPruned(f"pruned after {curves[0][-1].environment_steps} environment steps")
         return float(np.mean(scores))
+
+
+@contextlib.contextmanager
+def _interruptions_noted(trial: optuna.Trial) -> Iterator[None]:
+    """Ctrl-C is not the candidate's fault, whenever it comes: the sampler gives the same one out again."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        trial.set_user_attr("interrupted", True)
+        raise
 
 
 def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:

@@ -441,6 +441,26 @@ def test_ctrl_c_leaves_the_checkpoint_and_another_trial_of_the_place_goes_on(
     assert again.intermediate_values[800] == first.intermediate_values[800]
 
 
+@pytest.mark.parametrize("moment", ["suggest_aux_loss", "train_candidate", "mean_curve"])
+def test_ctrl_c_at_any_moment_is_not_the_candidates_fault(
+    moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objective = make_objective(tmp_path)
+    sampler = AuxLossSampler(population_size=2, n_random=2, n_prior=0, max_horizon=2, seed=0)
+    study = optuna.create_study(direction="maximize", sampler=sampler)
+
+    def interrupt(*arguments: Any, **keywords: Any) -> Any:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("search.objective.train_candidate", lambda *_, **__: training.TrainingRun([], 0.0))
+        patch.setattr(f"search.objective.{moment}", interrupt)
+        study.optimize(objective, n_trials=1, catch=CandidateFailed)
+    study.ask()
+    first, again = (trial.system_attrs["AuxLossSampler:place"] for trial in study.trials)
+    assert again == first
+
+
 def test_procedures_that_do_not_search_train_given_losses(tmp_path: Path) -> None:
     objective = make_objective(tmp_path)
     study = optuna.create_study(direction="maximize")

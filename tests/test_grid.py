@@ -1,0 +1,130 @@
+"""Lists of runs as studies: what a second program does, and what an older configuration left."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from search import evolve, grid, workers
+from search.config import SearchConfig
+from search.storage import open_storage
+from search.training import TrainingError
+
+CONFIG = SearchConfig(Path("some.yml"), "dm_control/cartpole-balance-v0", Path("hyperparameters.yml"), (400, 800))
+GRID = grid.Grid("some-grid", CONFIG, {"SAC": grid.Variant(None)}, [CONFIG.environment], [0])
+
+
+def make_study(folder: Path) -> optuna.Study:
+    return optuna.create_study(study_name=GRID.name, storage=open_storage(folder), direction="maximize")
+
+
+def finished(cell: grid.Cell, value: float) -> optuna.trial.FrozenTrial:
+    curve = [[400, value, 0.0], [800, 2 * value, 0.0]]
+    return optuna.trial.create_trial(value=value, user_attrs={**cell._asdict(), "curve": curve})
+
+
+class NoPool:
+    """Workers that find nothing to do."""
+
+    def __init__(self, *arguments: object):
+        pass
+
+    def __enter__(self) -> "NoPool":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        pass
+
+    def check(self, progressed: bool) -> bool:
+        return False
+
+
+def test_runs_that_another_program_has_are_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grid, "POLL_SECONDS", 0.1)
+    study = make_study(tmp_path)
+    (cell,) = GRID.cells
+    study.enqueue_trial({}, user_attrs=cell._asdict())
+    other = study.ask()
+    other.set_user_attr(workers.WORKER_KEY, workers.identity())  # alive
+    monkeypatch.setattr(grid, "WorkerPool", NoPool)
+    counts = []
+    for count in grid.run(GRID, tmp_path, str(tmp_path)):
+        counts.append(count)
+        if len(counts) == 5:
+            study.tell(other, 7.0)
+    assert counts == [*[(0, 0)] * 5, (1, 0)]  # waits, and trains nothing a second time
+    assert len(study.trials) == 1
+
+
+def test_runs_that_keep_failing_are_an_error_with_the_last_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grid, "WorkerPool", NoPool)
+    study = make_study(tmp_path)
+    for number in range(grid.MAX_TRIES):
+        attributes = {**GRID.cells[0]._asdict(), "reason": f"reason {number}"}
+        study.add_trial(optuna.trial.create_trial(state=TrialState.FAIL, user_attrs=attributes))
+    with pytest.raises(TrainingError, match="1 runs failed 3 times; the last reason: reason 2"):
+        list(grid.run(GRID, tmp_path, str(tmp_path)))
+
+
+def test_scores_are_those_of_the_runs_asked_for(tmp_path: Path) -> None:
+    study = make_study(tmp_path)
+    (cell,) = GRID.cells
+    for other in (cell, cell._replace(seed=9), cell._replace(environment="gone"), cell._replace(variant="renamed")):
+        study.add_trial(finished(other, 5.0))
+    study.add_trial(finished(cell, 6.0))  # two programs trained it
+    scores = grid.scores(study, GRID.cells)
+    assert scores.to_dict("records") == [{**cell._asdict(), "score": 5.0, "last": 10.0}]
+
+
+def test_what_an_interrupted_grid_left_is_passed_over_until_it_is_asked_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stub:
+        def __init__(self, *arguments: object):
+            pass
+
+        def train(self, trial: optuna.Trial, *arguments: object) -> float:
+            trial.set_user_attr("curve", [[400, 1.0, 0.0]])
+            return 1.0
+
+    class Pool(NoPool):
+        def __init__(self, worker: Callable[..., None], arguments: tuple[Any, ...], n_workers: int):
+            worker(*arguments)
+
+    monkeypatch.setattr(grid, "WorkerPool", Pool)
+    monkeypatch.setattr(grid, "Objective", Stub)
+    monkeypatch.setattr(grid, "POLL_SECONDS", 0.0)
+    study = make_study(tmp_path)
+    larger = replace(GRID, variants={**GRID.variants, "more": grid.Variant(None)})
+    for cell in larger.cells:
+        study.enqueue_trial({}, user_attrs=cell._asdict())
+    for asked_for in (GRID, larger):
+        assert list(grid.run(asked_for, tmp_path, str(tmp_path)))[-1] == (len(asked_for.cells), 0)
+        assert len(grid.scores(study, asked_for.cells)) == len(asked_for.cells)
+    assert sum(trial.state == TrialState.COMPLETE for trial in study.trials) == 2
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [
+        ({"environment": "dm_control/cartpole-swingup-v0"}, "environment"),
+        ({"checkpoints": (800, 1600)}, "checkpoints"),
+        ({"evaluation_episodes": 3}, "evaluation_episodes"),
+        ({"seeds": (1,)}, "seeds"),
+        ({"overrides": {"batch_size": 16}}, "batch_size"),
+    ],
+    ids=str,
+)
+def test_a_search_that_trains_otherwise_is_another_one(tmp_path: Path, changed: dict, name: str) -> None:
+    (tmp_path / "hyperparameters.yml").write_text("default: {batch_size: 8, policy_kwargs: {net_arch: [8]}}\n")
+    values = {**vars(CONFIG), "hyperparameters": tmp_path / "hyperparameters.yml"}
+    study = optuna.create_study(study_name="some")
+    evolve.check_training(SearchConfig(**values), study)
+    evolve.check_training(SearchConfig(**{**values, "stages": 9, "overrides": {"device": "cpu"}}), study)
+    with pytest.raises(ValueError, match=f"'some' was begun with {name}="):
+        evolve.check_training(SearchConfig(**{**values, **changed}), study)
+    assert study.user_attrs[evolve.TRAINING_KEY]["batch_size"] == 8
