@@ -259,7 +259,9 @@ def cross_validate(
 
 Run = Annotated[
     Path | None,
-    typer.Argument(help="Folder of a search. Not needed with --storage, but pictures of notes lie there."),
+    typer.Argument(
+        help="Folder of a search, or its configuration file. Not needed with --storage, but pictures of notes lie there."
+    ),
 ]
 
 
@@ -278,6 +280,7 @@ def dashboard(
         from search.evolve import ARTIFACTS
         from search.storage import open_storage
 
+        folder = _folder_of(folder)
         opened = open_storage(storage or str(_need_folder(folder)), create=False)
         console.print(f"http://{host}:{port}/  (Ctrl-C to stop)", highlight=False)
         serve(opened, (folder or Path("runs")) / ARTIFACTS, host, port)
@@ -299,6 +302,7 @@ def report(
         from search.report import write_report
         from search.storage import load_study, open_storage
 
+        folder = _folder_of(folder)
         opened = open_storage(storage or str(_need_folder(folder)), create=False)
         settings = None if config is None else load_config(config)
         name = study or (None if folder is None else folder.name)
@@ -307,6 +311,11 @@ def report(
         shown = None if settings is None else evolve.settings(settings)
         write_report(load_study(opened, name), path, lines, shown, provenance())
         console.print(f"Report: {path}", markup=False, soft_wrap=True, highlight=False)
+
+
+def _folder_of(run: Path | None) -> Path | None:
+    """The folder of a search that may be named by its configuration file, as in all other commands."""
+    return run_folder(run, None) if run is not None and run.suffix in (".yml", ".yaml") else run
 
 
 def _need_folder(folder: Path | None) -> Path:

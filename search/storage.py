@@ -13,6 +13,7 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.storages.journal._file import BaseJournalFileLock, get_lock_file
+from sqlalchemy.engine import make_url
 
 if sys.platform != "win32":
     import fcntl
@@ -90,15 +91,17 @@ def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
     :param where: A folder, for the embedded journal in it, which is safe for several processes of one machine; a file
         that ends in ``.log``, for a journal; or the URL of a database, such as ``sqlite:///study.db`` or
         ``postgresql://user:password@host/database``
-    :param create: Whether to make a journal that is not there
+    :param create: Whether to make a journal, or a file of SQLite, that is not there
     :raises ValueError: when it cannot be opened; passwords are left out of the message
     """
     where = str(where)
     path = Path(where)
     path = path if path.suffix == ".log" else path / JOURNAL
-    if "://" not in where and not create and not path.exists():
-        raise ValueError(f"there is no study in {where}: {path} does not exist")
     try:
+        if where.startswith("sqlite"):
+            path = Path(make_url(where).database or ":memory:")
+        if not create and ("://" not in where or where.startswith("sqlite")) and not path.exists():
+            raise FileNotFoundError(f"{path} does not exist")
         if "://" in where:
             connect_args = {"timeout": SQLITE_TIMEOUT} if where.startswith("sqlite") else {}
             with warnings.catch_warnings():

@@ -6,13 +6,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import optuna
 import pytest
 import yaml
+from optuna.storages import BaseStorage
 from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
 from search.cli import ZOO, app
+from search.storage import open_storage
 
 ROOT = Path(__file__).parent.parent
 HYPER = {
@@ -120,3 +123,17 @@ def test_losses_lists_the_whole_catalogue() -> None:
 
 def test_the_default_file_of_hyperparameters_is_there() -> None:
     assert (ZOO / "aarl_state.yml").is_file()
+
+
+@pytest.mark.parametrize("run", ["runs/some", "elsewhere/some.yml"])
+def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(run: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    optuna.create_study(study_name="some", storage=open_storage("runs/some"))
+    served = []
+
+    def serve(storage: BaseStorage, artifacts: Path, host: str, port: int) -> None:
+        served.append((optuna.get_all_study_names(storage), artifacts, host, port))
+
+    monkeypatch.setattr("search.dashboard.serve", serve)
+    result = runner.invoke(app, ["dashboard", run, "--port", "8123"])
+    assert result.exit_code == 0, result.stderr
+    assert served == [(["some"], Path("runs/some/artifacts"), "127.0.0.1", 8123)]

@@ -26,6 +26,16 @@ def test_a_line_that_was_cut_short_does_not_spoil_the_journal(tmp_path: Path, ke
     assert journal.read_bytes().startswith(whole)
 
 
+@pytest.mark.parametrize("where", ["runs", "sqlite:///study.db", "sqlite+pysqlite:///study.db", "other.log"])
+def test_looking_makes_no_storage(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="does not exist"):
+        open_storage(where, create=False)
+    assert not list(tmp_path.iterdir())
+    optuna.create_study(study_name="there", storage=open_storage(where))
+    assert optuna.get_all_study_names(open_storage(where, create=False)) == ["there"]
+
+
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
