@@ -260,7 +260,8 @@ def cross_validate(
 Run = Annotated[
     Path | None,
     typer.Argument(
-        help="Folder of a search, or its configuration file. Not needed with --storage, but pictures of notes lie there."
+        help="Folder of a search, or its configuration file. Not needed with --storage (but pictures of notes lie there), "
+        "nor if there is only one in runs/."
     ),
 ]
 
@@ -280,8 +281,8 @@ def dashboard(
         from search.evolve import ARTIFACTS
         from search.storage import open_storage
 
-        folder = _folder_of(folder)
-        opened = open_storage(storage or str(_need_folder(folder)), create=False)
+        folder = _search_folder(folder, storage)
+        opened = open_storage(storage or str(folder), create=False)
         console.print(f"http://{host}:{port}/  (Ctrl-C to stop)", highlight=False)
         serve(opened, (folder or Path("runs")) / ARTIFACTS, host, port)
 
@@ -302,8 +303,8 @@ def report(
         from search.report import write_report
         from search.storage import load_study, open_storage
 
-        folder = _folder_of(folder)
-        opened = open_storage(storage or str(_need_folder(folder)), create=False)
+        folder = _search_folder(folder, storage)
+        opened = open_storage(storage or str(folder), create=False)
         settings = None if config is None else load_config(config)
         name = study or (None if folder is None else folder.name)
         path = out or (folder or Path()) / "report.html"
@@ -313,15 +314,17 @@ def report(
         console.print(f"Report: {path}", markup=False, soft_wrap=True, highlight=False)
 
 
-def _folder_of(run: Path | None) -> Path | None:
-    """The folder of a search that may be named by its configuration file, as in all other commands."""
-    return run_folder(run, None) if run is not None and run.suffix in (".yml", ".yaml") else run
-
-
-def _need_folder(folder: Path | None) -> Path:
-    if folder is None:
-        raise ValueError("name the folder of a search, or its --storage")
-    return folder
+def _search_folder(run: Path | None, storage: str | None) -> Path | None:
+    """The folder of a search, which its configuration file may name too; if nothing is named, the only one in runs/."""
+    if run is not None:
+        return run_folder(run, None) if run.suffix in (".yml", ".yaml") else run
+    if storage is not None:
+        return None
+    folders = sorted(path.parent for path in Path("runs").glob("*/journal.log"))
+    if len(folders) != 1:
+        there = ", ".join(map(str, folders)) or "none"
+        raise ValueError(f"name the folder of a search, or its --storage; there are: {there}")
+    return folders[0]
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import optuna
 from optuna.artifacts import FileSystemArtifactStore
+from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
 from search import grid, workers
@@ -146,6 +147,11 @@ def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
                 time.sleep(POLL_SECONDS)
         except SearchComplete:
             return
+        except (UpdateFinishedTrialError, ValueError) as error:
+            # A laptop that slept: others took this worker for dead and failed its trial, whose place they give out again.
+            if not (isinstance(error, UpdateFinishedTrialError) or str(error).startswith("Cannot tell a FAIL trial")):
+                raise
+            logger.warning("A trial of this worker was failed by another one meanwhile: %s", error)
 
 
 def search(config: SearchConfig, folder: Path, where: str, n_workers: int = 1) -> Iterator[Progress]:

@@ -37,7 +37,7 @@ SETTINGS_KEY = "AuxLossSampler:settings"
 # Draws for one place before a duplicate is accepted: only very small spaces run out of new losses.
 MAX_DRAWS = 300
 # How often a candidate is given out again after its worker died, before it is taken for the cause.
-MAX_DEATHS = 3
+MAX_DEATHS = 10
 # Seconds without a sign of life after which a trial that never got a place is given up.
 ORPHAN_SECONDS = 60.0
 

@@ -69,6 +69,8 @@ def start(*arguments: object, folder: Path) -> subprocess.Popen[str]:
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
+        # Whoever runs the tests in the background (nohup, CI) may ignore Ctrl-C, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 
@@ -129,7 +131,7 @@ def test_search_survives_kill_and_interrupt_and_ends_as_if_nothing_had_been(conf
     wait_for(tmp_path, process, finished=5)
     os.killpg(process.pid, signal.SIGINT)  # Ctrl-C
     output, _ = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Interrupted" in output and "Traceback" not in output
+    assert process.returncode == 130 and "Interrupted" in output and "Traceback" not in output, output
 
     output = aarl("search", config, "--workers", 2, folder=tmp_path)
     assert "stage 1: 4/4 done" in output and "stage 2: 4/4 done" in output
@@ -192,12 +194,14 @@ def test_the_other_procedures_on_a_finished_search(config: Path, tmp_path: Path)
 def test_unusable_input_is_one_line(config: Path, tmp_path: Path) -> None:
     aarl("search", config, "--stages", 1, folder=tmp_path)
     config.write_text(config.read_text().replace("population_size: 4", "population_size: 6"))
+    (tmp_path / "runs/other").mkdir()
+    (tmp_path / "runs/other/journal.log").touch()
     for arguments, culprit in (
         (("search", config), "population_size"),
         (("cross-validate", config, "--study", "smal"), "'smal'"),
         (("cross-validate", config, "--folder", "elsewhere"), "elsewhere"),
         (("report", "elsewhere"), "elsewhere"),
-        (("report",), "--storage"),
+        (("report",), "runs/other, runs/small"),
         (("search", tmp_path / "missing.yml"), "missing.yml"),
         (("search", config, "--storage", "postgresql://me:secret@127.0.0.1:1/nothing"), "me:***"),
     ):
