@@ -1,6 +1,5 @@
 """The evolution (paper, sections 2.2 and 3): a study that worker processes of one machine or many fill stage by stage."""
 
-import json
 import logging
 import time
 from collections.abc import Iterator
@@ -31,8 +30,6 @@ MAX_FAILURES = 10
 POLL_SECONDS = 1.0
 # Seconds between two drawings of the evolution: each stays in the storage, a hundred kilobytes for a whole search.
 PLOT_SECONDS = 300.0
-# User attribute of a study: what decides the scores beside the losses.
-TRAINING_KEY = "training"
 ARTIFACTS = "artifacts"  # folder of the pictures in notes
 
 
@@ -60,30 +57,6 @@ def settings(config: SearchConfig) -> dict[str, Any]:
     hidden = ("path", "overrides", "hyperparameters", "cross_validation", "operator_selection", "baselines")
     shown = {item.name: getattr(config, item.name) for item in fields(config) if item.name not in hidden}
     return {**shown, **config.hyperparameters_for(config.environment)}
-
-
-def check_training(config: SearchConfig, study: optuna.Study) -> None:
-    """
-    Refuse to go on with a study whose candidates were trained in another way: scores could not be compared.
-
-    :param config: The search
-    :param study: Its study
-    :raises ValueError: naming the first setting that differs
-    """
-    names = ("environment", "checkpoints", "evaluation_episodes", "seeds")
-    training = {name: getattr(config, name) for name in names} | config.hyperparameters_for(config.environment)
-    training = {name: value for name, value in training.items() if name not in ("n_timesteps", "device")}  # these do not
-    training = json.loads(json.dumps(training))
-    begun = study.user_attrs.get(TRAINING_KEY)
-    if begun is None:
-        study.set_user_attr(TRAINING_KEY, training)
-        return
-    for name in training | begun:
-        if begun.get(name) != training.get(name):
-            raise ValueError(
-                f"study {study.study_name!r} was begun with {name}={begun.get(name)!r}, not {training.get(name)!r}: "
-                "give the file of another search another name"
-            )
 
 
 def baselines(config: SearchConfig) -> grid.Grid:
@@ -171,7 +144,7 @@ def search(config: SearchConfig, folder: Path, where: str, n_workers: int = 1) -
     study = optuna.create_study(
         study_name=study_name(config), storage=storage, sampler=sampler, direction="maximize", load_if_exists=True
     )
-    check_training(config, study)
+    grid.check_training(config, study)
     progress = look(study, sampler, n_workers)  # refuses a study that was begun with other settings of the sampler
     annotate_study(study, settings(config), provenance())
     lines = baseline_scores(config, storage)

@@ -1,6 +1,7 @@
 """Studies that train a given list of runs instead of searching: variants x environments x seeds, each once."""
 
 import itertools
+import json
 import re
 import time
 from collections import Counter
@@ -26,6 +27,8 @@ from search.training import TrainingError
 # How often a run is tried that fails, or whose worker dies.
 MAX_TRIES = 3
 POLL_SECONDS = 1.0
+# User attribute of a study: what decides the scores beside the losses.
+TRAINING_KEY = "training"
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,30 @@ class Grid:
         return [Cell(variant, environment, seed) for seed, environment, variant in product]
 
 
+def check_training(config: SearchConfig, study: optuna.Study) -> None:
+    """
+    Refuse to go on with a study whose runs were trained in another way: scores could not be compared.
+
+    :param config: The search
+    :param study: Its study
+    :raises ValueError: naming the first setting that differs
+    """
+    names = ("environment", "checkpoints", "evaluation_episodes", "seeds")
+    training = {name: getattr(config, name) for name in names} | config.hyperparameters_for(config.environment)
+    training = {name: value for name, value in training.items() if name not in ("n_timesteps", "device")}  # these do not
+    training = json.loads(json.dumps(training))
+    begun = study.user_attrs.get(TRAINING_KEY)
+    if begun is None:
+        study.set_user_attr(TRAINING_KEY, training)
+        return
+    for name in training | begun:
+        if begun.get(name) != training.get(name):
+            raise ValueError(
+                f"study {study.study_name!r} was begun with {name}={begun.get(name)!r}, not {training.get(name)!r}: "
+                "give the file of another search another name"
+            )
+
+
 def run(grid: Grid, folder: Path, where: str, n_workers: int = 1) -> Iterator[tuple[int, int]]:
     """
     Train what the study does not have yet. Yields finished and failed runs about once a second.
@@ -93,6 +120,7 @@ def run(grid: Grid, folder: Path, where: str, n_workers: int = 1) -> Iterator[tu
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = open_storage(where)
     study = optuna.create_study(study_name=grid.name, storage=storage, direction="maximize", load_if_exists=True)
+    check_training(grid.config, study)
     _enqueue(study, grid.cells)
     finished, failed = _count(study, grid.cells)
     yield finished, failed

@@ -9,7 +9,7 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from search import evolve, grid, workers
+from search import grid, workers
 from search.config import SearchConfig
 from search.storage import open_storage
 from search.training import TrainingError
@@ -123,8 +123,8 @@ def test_a_search_that_trains_otherwise_is_another_one(tmp_path: Path, changed: 
     (tmp_path / "hyperparameters.yml").write_text("default: {batch_size: 8, policy_kwargs: {net_arch: [8]}}\n")
     values = {**vars(CONFIG), "hyperparameters": tmp_path / "hyperparameters.yml"}
     study = optuna.create_study(study_name="some")
-    evolve.check_training(SearchConfig(**values), study)
-    evolve.check_training(SearchConfig(**{**values, "stages": 9, "overrides": {"device": "cpu"}}), study)
+    grid.check_training(SearchConfig(**values), study)
+    grid.check_training(SearchConfig(**{**values, "stages": 9, "overrides": {"device": "cpu"}}), study)
     with pytest.raises(ValueError, match=f"'some' was begun with {name}="):
-        evolve.check_training(SearchConfig(**{**values, **changed}), study)
-    assert study.user_attrs[evolve.TRAINING_KEY]["batch_size"] == 8
+        grid.check_training(SearchConfig(**{**values, **changed}), study)
+    assert study.user_attrs[grid.TRAINING_KEY]["batch_size"] == 8
