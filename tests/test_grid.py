@@ -14,7 +14,8 @@ from search.config import SearchConfig
 from search.storage import open_storage
 from search.training import TrainingError
 
-CONFIG = SearchConfig(Path("some.yml"), "dm_control/cartpole-balance-v0", Path("hyperparameters.yml"), (400, 800))
+HYPERPARAMETERS = Path(__file__).parent.parent / "zoo_configs" / "demo.yml"
+CONFIG = SearchConfig(Path("some.yml"), "dm_control/cartpole-balance-v0", HYPERPARAMETERS, (400, 800))
 GRID = grid.Grid("some-grid", CONFIG, {"SAC": grid.Variant(None)}, [CONFIG.environment], [0])
 
 
