@@ -19,6 +19,8 @@ from pathlib import Path
 
 import stable_baselines3
 
+from search.provenance import provenance
+
 # By default all tests that run SAC, and those of what SACAux has of its own (replay buffer, n-step returns, gSDE).
 SELECTION = "SAC or sac or sde or n_step or buffer"
 
@@ -125,7 +127,8 @@ def main() -> None:
         if test["outcome"] in ("failed", "not collected"):
             print(f"  {name}: {test['reason']}")
     if args.out:
-        args.out.write_text(json.dumps({"sb3": stable_baselines3.__version__, **counts, "tests": tests}, indent=2))
+        result = {"provenance": provenance(), "sb3": stable_baselines3.__version__, **counts, "tests": tests}
+        args.out.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":
