@@ -23,6 +23,7 @@ from sb3_aarl.aux_loss import AuxLoss
 from search import mutations, space, workers
 from search.space import MAX_HORIZON, check_operators
 from search.token_model import TokenModel
+from search.trials import loss_of
 
 logger = logging.getLogger(__name__)
 
@@ -330,7 +331,7 @@ class AuxLossSampler(BaseGASampler):
     def after_trial(self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None) -> None:
         """Mark a candidate that failed in a live worker, or was pruned as invalid: its place gets another one."""
         failed = state == TrialState.FAIL and not trial.user_attrs.get("interrupted")
-        if failed or (state == TrialState.PRUNED and _loss(trial) is None):
+        if failed or (state == TrialState.PRUNED and loss_of(trial) is None):
             study._storage.set_trial_system_attr(trial._trial_id, REJECTED_KEY, True)
 
     def get_trial_generation(self, study: Study, trial: FrozenTrial) -> int:
@@ -488,14 +489,6 @@ class AuxLossSampler(BaseGASampler):
         return sorted(population, key=rank)[: max(1, round(self.parents * len(population)))]
 
 
-def _loss(trial: FrozenTrial) -> AuxLoss | None:
-    """The loss of a trial's parameters, None where they are none."""
-    try:
-        return space.params_to_loss(trial.params)
-    except (KeyError, ValueError):
-        return None
-
-
 def _is_invalid(trial: FrozenTrial) -> bool:
     """Whether a trial was pruned because it was no loss: that costs nothing, and fills no place."""
     return trial.state == TrialState.PRUNED and REJECTED_KEY in trial.system_attrs
@@ -571,7 +564,7 @@ class _Evolution:
             if len(holders) < self._size(stage) or any(holder.state not in FILLED for holder in holders):
                 return stage - 1
             self._plan_random(stage + 1)  # while the stage before is still the last one known
-            losses = {holder.number: loss for holder in holders if (loss := _loss(holder)) is not None}
+            losses = {holder.number: loss for holder in holders if (loss := loss_of(holder)) is not None}
             if not losses:
                 raise RuntimeError(f"no trial of stage {stage} has a loss: the objective has to call suggest_aux_loss")
             population = [holder for holder in holders if holder.number in losses]
