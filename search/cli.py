@@ -137,7 +137,7 @@ def search(
         settings = replace(load_config(config), **{key: value for key, value in changes.items() if value is not None})
         path = run_folder(config, folder)
         where = storage or str(path)
-        console.print(f"Study {evolve.study_name(settings)} in {without_password(where)}", soft_wrap=True, markup=False)
+        console.print(f"Study {settings.name} in {without_password(where)}", soft_wrap=True, markup=False)
         shown: evolve.Progress | None = None
         with live() as show:
             for progress in evolve.search(settings, path, where, workers):
@@ -248,7 +248,7 @@ def cross_validate(
 
         settings = load_config(config)
         path = run_folder(config, folder)
-        searched = load_study(open_storage(storage or str(path), create=False), study or config.stem)
+        searched = load_study(open_storage(storage or str(path), create=False), study or settings.name)
         grid = cross_validation.make_grid(settings, searched, top)
         runs = _train_grid(grid, path, storage, workers)
         table = cross_validation.ranking(runs)

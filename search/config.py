@@ -140,6 +140,11 @@ class SearchConfig:
     baselines: tuple[Baseline, ...] = ()
     overrides: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def name(self) -> str:
+        """The name of the search's study: that of its file."""
+        return self.path.stem
+
     def hyperparameters_for(self, environment: str, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """
         The hyper-parameters of a training.

@@ -47,11 +47,6 @@ class Progress(NamedTuple):
     seconds_to_go: float | None
 
 
-def study_name(config: SearchConfig) -> str:
-    """The name of a search's study: that of its file."""
-    return config.path.stem
-
-
 def settings(config: SearchConfig) -> dict[str, Any]:
     """What a note or a report says of the settings: the hyper-parameters written out, in plain values."""
     hidden = ("path", "overrides", "hyperparameters", "cross_validation", "operator_selection", "baselines")
@@ -66,7 +61,7 @@ def baselines(config: SearchConfig) -> grid.Grid:
     :param config: The search
     """
     variants = {baseline.name: grid.Variant(baseline.aux_loss, baseline.overrides) for baseline in config.baselines}
-    return grid.Grid(f"{study_name(config)}-baselines", config, variants, [config.environment], config.seeds)
+    return grid.Grid(f"{config.name}-baselines", config, variants, [config.environment], config.seeds)
 
 
 def baseline_scores(config: SearchConfig, storage: optuna.storages.BaseStorage) -> list[tuple[str, float]]:
@@ -93,9 +88,7 @@ def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # it shows a failed trial with all of its traceback
     sampler = AuxLossSampler(**config.sampler_settings(), worker=workers.identity())
-    study = optuna.load_study(
-        study_name=study_name(config), storage=open_storage(where), sampler=sampler, pruner=make_pruner(config)
-    )
+    study = optuna.load_study(study_name=config.name, storage=open_storage(where), sampler=sampler, pruner=make_pruner(config))
     objective = Objective(config, folder / "candidates")
     artifacts = _artifacts(folder)
     failures = 0
@@ -142,7 +135,7 @@ def search(config: SearchConfig, folder: Path, where: str, n_workers: int = 1) -
     storage = open_storage(where)
     sampler = AuxLossSampler(**config.sampler_settings())
     study = optuna.create_study(
-        study_name=study_name(config), storage=storage, sampler=sampler, direction="maximize", load_if_exists=True
+        study_name=config.name, storage=storage, sampler=sampler, direction="maximize", load_if_exists=True
     )
     grid.check_training(config, study)
     progress = look(study, sampler, n_workers)  # refuses a study that was begun with other settings of the sampler

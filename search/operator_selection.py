@@ -27,7 +27,7 @@ def make_grid(config: SearchConfig) -> Grid:
         for operator in OPERATORS
         for negatives in (True, False)
     }
-    return Grid(f"{config.path.stem}-operators", config, variants, section.environments, section.seeds)
+    return Grid(f"{config.name}-operators", config, variants, section.environments, section.seeds)
 
 
 def table(runs: pd.DataFrame) -> pd.DataFrame:

@@ -13,6 +13,8 @@ from typing import Any
 
 # Deaths of workers without a trial finished in between, after which the pool gives up.
 MAX_DEATHS = 5
+# Seconds after which a worker that still runs is interrupted again: an exception that falls into a destructor is lost.
+INTERRUPT_SECONDS = 8.0
 
 
 class WorkerError(RuntimeError):
@@ -35,9 +37,15 @@ def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, 
         os._exit(1)
 
 
+_interrupted: dict[str, float] = {}
+
+
 def _interrupt_once(signum: int, frame: Any) -> None:
     """A terminal's Ctrl-C reaches a worker twice, from the pool too: the second must not disturb its putting away."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    now = time.monotonic()
+    if now - _interrupted.get("at", -INTERRUPT_SECONDS) < INTERRUPT_SECONDS / 2:
+        return
+    _interrupted["at"] = now
     raise KeyboardInterrupt
 
 
@@ -109,14 +117,18 @@ class WorkerPool:
         return bool(self.processes)
 
     def __exit__(self, *exception: Any) -> None:
+        for _ in range(6):
+            for process in self.processes:
+                if process.pid is not None and process.exitcode is None:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(process.pid, signal.SIGINT)
+            deadline = time.monotonic() + INTERRUPT_SECONDS
+            for process in self.processes:
+                process.join(timeout=max(0.0, deadline - time.monotonic()))
+            if all(process.exitcode is not None for process in self.processes):
+                return
         for process in self.processes:
-            if process.pid is not None and process.exitcode is None:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(process.pid, signal.SIGINT)
-        for process in self.processes:
-            process.join(timeout=60)
-            if process.exitcode is None:
-                process.kill()
+            process.kill()
 
 
 @contextlib.contextmanager
