@@ -16,7 +16,7 @@ from search import grid, workers
 from search.config import SearchConfig
 from search.dashboard import annotate_study, annotate_trial, update_plots
 from search.objective import CandidateFailed, Objective, make_pruner
-from search.pool import WorkerPool
+from search.pool import WorkerPool, uninterrupted
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
 from search.storage import open_storage
@@ -95,7 +95,8 @@ def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
 
     def finished(study: optuna.Study, trial: FrozenTrial) -> None:
         nonlocal failures
-        annotate_trial(study, trial, artifacts)
+        with uninterrupted():
+            annotate_trial(study, trial, artifacts)
         failures = failures + 1 if trial.state == TrialState.FAIL else 0
         reason = trial.user_attrs.get("reason")
         if failures:

@@ -46,7 +46,24 @@ def _interrupt_once(signum: int, frame: Any) -> None:
     if now - _interrupted.get("at", -INTERRUPT_SECONDS) < INTERRUPT_SECONDS / 2:
         return
     _interrupted["at"] = now
-    raise KeyboardInterrupt
+    if not _shielded:
+        raise KeyboardInterrupt
+    _shielded[-1] = True
+
+
+_shielded: list[bool] = []
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Any:
+    """Inside, a worker's interruption waits for the end: in destructors, which matplotlib runs, it would be lost."""
+    _shielded.append(False)
+    try:
+        yield
+    finally:
+        was_interrupted = _shielded.pop()
+    if was_interrupted:
+        raise KeyboardInterrupt
 
 
 def _stop_with_parent(parent: int) -> None:
