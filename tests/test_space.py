@@ -1,6 +1,7 @@
 """The search space: parameters and back, validity, and the distribution of random losses and of the priors."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import optuna
@@ -13,6 +14,7 @@ from optuna.trial import FixedTrial, TrialState
 from scipy.stats import binomtest, chisquare
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
+from search.sampler import PLACE_KEY, AuxLossSampler
 from search.space import (
     check_operators,
     distributions,
@@ -184,3 +186,23 @@ def test_unknown_operators_are_named(operators: tuple[str, ...] | str, culprit: 
         check_operators(operators)
     with pytest.raises(ValueError, match=culprit):
         suggest_aux_loss(FixedTrial({"horizon": 1}), operators=operators)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"max_horizon": 3}, "max_horizon=2, suggest_aux_loss asks for max_horizon=3"),
+        ({"max_horizon": 1}, "max_horizon=2, suggest_aux_loss asks for max_horizon=1"),
+        ({"max_horizon": 2}, r"operators=\('mse', 'inner'\), suggest_aux_loss asks for operators=None"),
+        ({"max_horizon": 2, "operators": ["mse", "cosine"]}, r"asks for operators=\('mse', 'cosine'\)"),
+    ],
+    ids=str,
+)
+def test_a_space_other_than_the_sampler_s_is_refused(settings: dict[str, Any], message: str) -> None:
+    sampler = AuxLossSampler(max_horizon=2, operators=["mse", "inner"], seed=0)
+    study = optuna.create_study(sampler=sampler)
+    with pytest.raises(ValueError, match=message):
+        suggest_aux_loss(study.ask(), **settings)
+    trial = study.ask()
+    loss = suggest_aux_loss(trial, 2, ["mse", "inner"])
+    assert str(loss) == study.trials[trial.number].system_attrs[PLACE_KEY]["loss"]
