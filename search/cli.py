@@ -108,6 +108,12 @@ Folder = Annotated[
     typer.Option(help="Folder of the search. Default: runs/NAME, NAME being that of the configuration file."),
 ]
 Workers = Annotated[int, typer.Option(help="Processes that train at the same time.", min=1)]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        help="Threads of each process; small networks are often fastest with 1. Default: its share of the cores.", min=1
+    ),
+]
 SearchFile = Annotated[Path, typer.Argument(help="Configuration of a search, such as zoo_configs/search/demo.yml.")]
 
 
@@ -121,6 +127,7 @@ def search(
     config: SearchFile,
     storage: Storage = None,
     workers: Workers = 1,
+    threads: Threads = None,
     stages: Annotated[int | None, typer.Option(help="Number of stages. Default: the file's.", min=1)] = None,
     pruner: Annotated[
         Literal["none", "median", "hyperband"] | None, typer.Option(help="Optuna's pruner. Default: the file's.")
@@ -140,7 +147,7 @@ def search(
         console.print(f"Study {settings.name} in {without_password(where)}", soft_wrap=True, markup=False)
         shown: evolve.Progress | None = None
         with live() as show:
-            for progress in evolve.search(settings, path, where, workers):
+            for progress in evolve.search(settings, path, where, workers, threads):
                 # Without a terminal there is a line for everything that has changed.
                 if console.is_terminal or shown is None or progress.stages != shown.stages:
                     show(_stages_table(progress) if console.is_terminal else _stages_line(progress))
@@ -178,7 +185,7 @@ def _stages_line(progress: "Progress") -> str:
     return "; ".join(stages) + best
 
 
-def _train_grid(grid: "Grid", folder: Path, storage: str | None, workers: int) -> "pd.DataFrame":
+def _train_grid(grid: "Grid", folder: Path, storage: str | None, workers: int, threads: int | None) -> "pd.DataFrame":
     """Train the runs of a grid that are missing, with a progress bar, and return the scores of all."""
     from search import grid as grids
     from search.storage import load_study, open_storage
@@ -187,7 +194,7 @@ def _train_grid(grid: "Grid", folder: Path, storage: str | None, workers: int) -
     n_runs = len(grid.cells)
     with ProgressBar(*ProgressBar.get_default_columns(), MofNCompleteColumn(), console=console) as bar:
         task = bar.add_task(grid.name, total=n_runs)
-        for finished, failed in grids.run(grid, folder, where, workers):
+        for finished, failed in grids.run(grid, folder, where, workers, threads):
             bar.update(task, completed=finished, description=f"{grid.name}, {failed} failed" if failed else grid.name)
     return grids.scores(load_study(open_storage(where, create=False), grid.name), grid.cells)
 
@@ -205,7 +212,9 @@ def _show(frame: "pd.DataFrame", title: str) -> None:
 
 
 @app.command()
-def baselines(config: SearchFile, storage: Storage = None, workers: Workers = 1, folder: Folder = None) -> None:
+def baselines(
+    config: SearchFile, storage: Storage = None, workers: Workers = 1, threads: Threads = None, folder: Folder = None
+) -> None:
     """Train the baselines of a search, which the evolution is compared with."""
     with clear_errors():
         from search import evolve
@@ -214,20 +223,22 @@ def baselines(config: SearchFile, storage: Storage = None, workers: Workers = 1,
         settings = load_config(config)
         if not settings.baselines:
             raise ValueError(f"{config} names no baselines")
-        runs = _train_grid(evolve.baselines(settings), run_folder(config, folder), storage, workers)
+        runs = _train_grid(evolve.baselines(settings), run_folder(config, folder), storage, workers, threads)
         means = runs.groupby("variant")["score"].agg(["mean", "std", "count"]).rename(columns={"count": "runs"})
         _show(means.sort_values("mean", ascending=False), f"Baselines on {settings.environment}, AULC")
 
 
 @app.command("select-operator")
-def select_operator(config: SearchFile, storage: Storage = None, workers: Workers = 1, folder: Folder = None) -> None:
+def select_operator(
+    config: SearchFile, storage: Storage = None, workers: Workers = 1, threads: Threads = None, folder: Folder = None
+) -> None:
     """Compare the ten operators on forward dynamics, as in the paper's table 2."""
     with clear_errors():
         from search import operator_selection
         from search.config import load_config
 
         settings = load_config(config)
-        runs = _train_grid(operator_selection.make_grid(settings), run_folder(config, folder), storage, workers)
+        runs = _train_grid(operator_selection.make_grid(settings), run_folder(config, folder), storage, workers, threads)
         _show(operator_selection.table(runs), "Normalized returns at the last checkpoint (paper, table 2)")
 
 
@@ -238,6 +249,7 @@ def cross_validate(
     top: Annotated[int | None, typer.Option(help="How many candidates. Default: the file's.", min=1)] = None,
     storage: Storage = None,
     workers: Workers = 1,
+    threads: Threads = None,
     folder: Folder = None,
 ) -> None:
     """Train the best candidates of a search on several environments, and write the winner as YAML."""
@@ -250,7 +262,7 @@ def cross_validate(
         path = run_folder(config, folder)
         searched = load_study(open_storage(storage or str(path), create=False), study or settings.name)
         grid = cross_validation.make_grid(settings, searched, top)
-        runs = _train_grid(grid, path, storage, workers)
+        runs = _train_grid(grid, path, storage, workers, threads)
         table = cross_validation.ranking(runs)
         _show(table, "Cross-validation, AULC")
         winner = cross_validation.write_winner(table, path / "winner.yml")

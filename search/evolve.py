@@ -121,7 +121,9 @@ def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
             logger.warning("A trial of this worker was failed by another one meanwhile: %s", error)
 
 
-def search(config: SearchConfig, folder: Path, where: str, n_workers: int = 1) -> Iterator[Progress]:
+def search(
+    config: SearchConfig, folder: Path, where: str, n_workers: int = 1, threads: int | None = None
+) -> Iterator[Progress]:
     """
     Run a search, or go on with it: all that it knows is in the storage.
 
@@ -131,6 +133,7 @@ def search(config: SearchConfig, folder: Path, where: str, n_workers: int = 1) -
     :param folder: Its folder
     :param where: Its storage, as for ``open_storage``
     :param n_workers: Number of processes on this machine
+    :param threads: Threads of each, None for its share of the cores
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = open_storage(where)
@@ -143,7 +146,7 @@ def search(config: SearchConfig, folder: Path, where: str, n_workers: int = 1) -
     annotate_study(study, settings(config), provenance())
     lines = baseline_scores(config, storage)
     yield progress
-    with WorkerPool(run_worker, (config, folder, where), n_workers) as pool:
+    with WorkerPool(run_worker, (config, folder, where), n_workers, threads) as pool:
         ended, drawn, busy = -1, 0.0, True
         while busy:
             now = sum(stage.filled + stage.failed for stage in progress.stages)

@@ -107,7 +107,7 @@ def check_training(config: SearchConfig, study: optuna.Study) -> None:
             )
 
 
-def run(grid: Grid, folder: Path, where: str, n_workers: int = 1) -> Iterator[tuple[int, int]]:
+def run(grid: Grid, folder: Path, where: str, n_workers: int = 1, threads: int | None = None) -> Iterator[tuple[int, int]]:
     """
     Train what the study does not have yet. Yields finished and failed runs about once a second.
 
@@ -115,6 +115,7 @@ def run(grid: Grid, folder: Path, where: str, n_workers: int = 1) -> Iterator[tu
     :param folder: Folder of the search, for checkpoints and curves
     :param where: Storage of the search, as for ``open_storage``
     :param n_workers: Number of processes
+    :param threads: Threads of each, None for its share of the cores
     :raises TrainingError: when runs keep failing; the others were trained
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -125,7 +126,7 @@ def run(grid: Grid, folder: Path, where: str, n_workers: int = 1) -> Iterator[tu
     finished, failed = _count(study, grid.cells)
     yield finished, failed
     while finished < len(grid.cells):
-        with WorkerPool(_run_worker, (grid, folder, where), n_workers) as pool:
+        with WorkerPool(_run_worker, (grid, folder, where), n_workers, threads) as pool:
             busy, ended = True, -1
             while busy:
                 time.sleep(POLL_SECONDS)

@@ -39,13 +39,11 @@ class Objective:
 
     :param config: The search
     :param folder: Folder of the study; every candidate has one of its own in it, with its learning curves
-    :param threads: Threads of PyTorch in this process, None to leave them as they are
     """
 
-    def __init__(self, config: SearchConfig, folder: str | Path, threads: int | None = None):
+    def __init__(self, config: SearchConfig, folder: str | Path):
         self.config = config
         self.folder = Path(folder)
-        self.threads = threads
         self.commit = commit()
 
     def __call__(self, trial: optuna.Trial) -> float:
@@ -126,7 +124,6 @@ class Objective:
                     config.evaluation_episodes,
                     folder / f"seed-{seed}",
                     on_evaluation=report,
-                    threads=self.threads,
                 )
                 curves.append(run.curve)
                 scores.append(run.aulc)

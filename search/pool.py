@@ -83,16 +83,17 @@ class WorkerPool:
     :param target: Function that each worker runs; it returns when nothing is left to do
     :param arguments: Its arguments, which must be picklable
     :param n_workers: Number of processes
+    :param threads: Threads of PyTorch and BLAS in each, None for its share of the cores
     """
 
-    def __init__(self, target: Callable[..., None], arguments: tuple[Any, ...], n_workers: int):
+    def __init__(self, target: Callable[..., None], arguments: tuple[Any, ...], n_workers: int, threads: int | None = None):
         if n_workers < 1:
             raise ValueError(f"workers must be at least 1, not {n_workers}")
         # Not fork: PyTorch's threads and open storages do not survive it.
         self._context = multiprocessing.get_context("spawn")
         self._errors = self._context.SimpleQueue()
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._start = (target, arguments, self._errors, max(1, cores // n_workers))
+        self._start = (target, arguments, self._errors, threads or max(1, cores // n_workers))
         self.processes: list[BaseProcess] = []
         self.deaths = 0
         self._n_workers = n_workers

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_aarl import SACAux, catalog
@@ -81,7 +80,6 @@ def train_candidate(
     evaluation_episodes: int = 10,
     folder: str | Path | None = None,
     on_evaluation: Callable[[Evaluation], bool | None] | None = None,
-    threads: int | None = None,
     keep_model: bool = False,
     progress_bar: bool = False,
 ) -> TrainingRun:
@@ -104,15 +102,12 @@ def train_candidate(
     :param folder: Where checkpoint and curve are kept, None to keep nothing. One training at a time in a folder
     :param on_evaluation: Called after every evaluation, and after those of a run that goes on again. Training ends early
         if it returns False
-    :param threads: Threads of PyTorch in this process, None to leave them as they are
     :param keep_model: Whether to leave the trained model as ``model.zip`` in the folder
     :param progress_bar: Whether to show a progress bar
     :raises TrainingError: when the training fails while it runs, the cause being its ``__cause__``
     :raises FileExistsError: when the folder has the model of another training
     :raises ValueError: when environment or model cannot be made of these settings
     """
-    if threads is not None:
-        th.set_num_threads(threads)
     settings = dict(hyperparameters)
     settings.pop("n_timesteps", None)
     env_kwargs = settings.pop("env_kwargs", None) or {}

@@ -93,7 +93,7 @@ def test_what_an_interrupted_grid_left_is_passed_over_until_it_is_asked_for_agai
             return 1.0
 
     class Pool(NoPool):
-        def __init__(self, worker: Callable[..., None], arguments: tuple[Any, ...], n_workers: int):
+        def __init__(self, worker: Callable[..., None], arguments: tuple[Any, ...], *others: object):
             worker(*arguments)
 
     monkeypatch.setattr(grid, "WorkerPool", Pool)

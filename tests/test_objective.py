@@ -14,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 import optuna
 import pytest
-import torch as th
 import yaml
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import RandomSampler
@@ -88,7 +87,7 @@ def make_objective(folder: Path, **settings: Any) -> Objective:
         **settings,
     }
     (folder / "search.yml").write_text(yaml.safe_dump(values))
-    return Objective(load_config(folder / "search.yml"), folder / "runs", threads=1)
+    return Objective(load_config(folder / "search.yml"), folder / "runs")
 
 
 def make_study(pruner: BasePruner | None = None, losses: int = 1) -> optuna.Study:
@@ -174,7 +173,7 @@ def on_evaluation(evaluation):
     if evaluation.environment_steps == arguments["checkpoints"][1]:
         os.kill(os.getpid(), signal.SIGKILL)
 
-train_candidate(**arguments, on_evaluation=on_evaluation, threads=1)
+train_candidate(**arguments, on_evaluation=on_evaluation)
 """
 
 
@@ -469,15 +468,6 @@ def test_procedures_that_do_not_search_train_given_losses(tmp_path: Path) -> Non
     score = objective.train(trial, None, ENV, [2], identity)
     assert trial.user_attrs["loss"] == trial.user_attrs["canonical"] == "none"
     assert score == pytest.approx(np.mean([point[1] for point in trial.user_attrs["curve"]]))
-
-
-def test_threads_are_those_asked_for() -> None:
-    before = th.get_num_threads()
-    try:
-        train_candidate("Pendulum-v1", None, HYPER | {"env_kwargs": {}}, 0, [2], 1, threads=2)
-        assert th.get_num_threads() == 2
-    finally:
-        th.set_num_threads(before)
 
 
 def test_a_failure_has_a_cause(tmp_path: Path) -> None:

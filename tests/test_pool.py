@@ -1,9 +1,12 @@
-"""Worker processes: Ctrl-C."""
+"""Worker processes: Ctrl-C, threads."""
 
 import os
 import signal
 import time
 from pathlib import Path
+
+import pytest
+import torch as th
 
 from search.pool import WorkerPool
 
@@ -41,3 +44,16 @@ def test_a_second_interrupt_does_not_disturb_a_worker_that_puts_away_what_it_has
         (tmp_path / "twice").touch()
     assert (tmp_path / "away").exists()
     assert worker.exitcode == 128 + signal.SIGINT
+
+
+def write_threads(folder: Path) -> None:
+    """A worker that says how many threads it has."""
+    (folder / "threads").write_text(f"{th.get_num_threads()} {os.environ['OMP_NUM_THREADS']}")
+
+
+@pytest.mark.parametrize(("threads", "expected"), [(3, 3), (None, len(os.sched_getaffinity(0)))])
+def test_threads_are_those_asked_for_or_all_cores(threads: int | None, expected: int, tmp_path: Path) -> None:
+    with WorkerPool(write_threads, (tmp_path,), n_workers=1, threads=threads) as pool:
+        while pool.check(progressed=False):
+            time.sleep(0.01)
+    assert (tmp_path / "threads").read_text() == f"{expected} {expected}"
