@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import re
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -208,10 +207,8 @@ def _run_worker(grid: Grid, folder: Path, where: str) -> None:
             raise optuna.TrialPruned("enqueued by a grid that was interrupted, and not part of this one")
         trial.set_user_attr(workers.WORKER_KEY, workers.identity())
         variant = grid.variants[cell.variant]
-        # A folder of its own: two variants may have one loss.
-        name = re.sub(r"[^a-z0-9]+", "-", cell.variant.lower())[:80].strip("-")
-        train = Objective(grid.config, folder / grid.name / name).train
-        return train(trial, variant.aux_loss, cell.environment, [cell.seed], variant.overrides)
+        train = Objective(grid.config, folder / grid.name).train
+        return train(trial, variant.aux_loss, cell.environment, [cell.seed], variant.overrides, cell.variant)
 
     while study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
         study.optimize(objective, n_trials=1, catch=(CandidateFailed,))

@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from sb3_aarl.callbacks import Evaluation
 from search.config import SearchConfig
 from search.provenance import commit
 from search.space import suggest_aux_loss
+from search.storage import study_id
 from search.training import TrainingError, train_candidate
 
 
@@ -38,7 +40,8 @@ class Objective:
     ``study.optimize(objective, catch=CandidateFailed)`` goes on after a candidate that failed.
 
     :param config: The search
-    :param folder: Folder of the study; every candidate has one of its own in it, with its learning curves
+    :param folder: Where every candidate has a folder of its own, with its learning curves. Those of another study that
+        are there are passed over
     """
 
     def __init__(self, config: SearchConfig, folder: str | Path):
@@ -55,7 +58,7 @@ class Objective:
         """
         with _interruptions_noted(trial):
             loss = suggest_aux_loss(trial, self.config.max_horizon, self.config.operators)
-            return self._train(trial, loss, self.config.environment, self.config.seeds, {})
+            return self._train(trial, loss, self.config.environment, self.config.seeds, {}, None)
 
     def train(
         self,
@@ -64,6 +67,7 @@ class Objective:
         environment: str,
         seeds: Sequence[int],
         overrides: Mapping[str, Any] | None = None,
+        name: str | None = None,
     ) -> float:
         """
         Train a given loss for a trial, for procedures that do not search.
@@ -73,12 +77,14 @@ class Objective:
         :param environment: Id of the environment
         :param seeds: Training seeds
         :param overrides: Merged over the hyper-parameters of the configuration
+        :param name: Another trial of this name, loss, environment and seeds goes on where a killed one stopped; one at a
+            time. None for the trial's place, or its number
         :return: Mean AULC over the seeds
         :raises optuna.TrialPruned: when the pruner says so
         :raises CandidateFailed: as above
         """
         with _interruptions_noted(trial):
-            return self._train(trial, aux_loss, environment, seeds, overrides or {})
+            return self._train(trial, aux_loss, environment, seeds, overrides or {}, name)
 
     def _train(
         self,
@@ -87,11 +93,12 @@ class Objective:
         environment: str,
         seeds: Sequence[int],
         overrides: Mapping[str, Any],
+        name: str | None,
     ) -> float:
         config = self.config
         hyperparameters = config.hyperparameters_for(environment, overrides)
         checkpoints = config.checkpoints_for(environment)
-        folder = self.folder / _folder_name(trial, aux_loss, environment, seeds)
+        folder = self.folder / _folder_name(trial.study, name or _name(trial), aux_loss, environment, seeds)
         attributes = {
             "loss": "none" if aux_loss is None else str(aux_loss),
             "canonical": "none" if aux_loss is None else str(aux_loss.canonical()),
@@ -180,10 +187,18 @@ def make_pruner(config: SearchConfig) -> BasePruner:
     return NopPruner()
 
 
-def _folder_name(trial: optuna.Trial, aux_loss: AuxLoss | None, environment: str, seeds: Sequence[int]) -> str:
-    """The same for a trial that takes up what another one, killed, had begun: same place, loss, environment and seeds."""
-    digest = hashlib.sha256(f"{aux_loss} {environment} {list(seeds)}".encode()).hexdigest()[:12]
+def _name(trial: optuna.Trial) -> str:
+    """The same for a trial that takes up what another one, killed, had begun."""
     # From the storage: a Trial shows its user attributes as they were before the sampler gave it a place.
-    attributes = trial.study._storage.get_trial(trial._trial_id).user_attrs
-    stage, place = attributes.get("stage"), attributes.get("place")
-    return digest if stage is None else f"stage-{stage}-place-{place}-{digest}"
+    frozen = trial.study._storage.get_trial(trial._trial_id)
+    if "stage" in frozen.user_attrs:
+        return f"stage-{frozen.user_attrs['stage']}-place-{frozen.user_attrs['place']}"
+    # Other samplers may propose a loss twice at the same time. A heartbeat's copy knows whose copy it is.
+    return f"trial-{frozen.system_attrs.get('failed_trial', frozen.number)}"
+
+
+def _folder_name(study: optuna.Study, name: str, aux_loss: AuxLoss | None, environment: str, seeds: Sequence[int]) -> str:
+    """Readable, and different wherever anything of it differs."""
+    label = re.sub(r"[^a-z0-9]+", "-", name.lower())[:80].strip("-")
+    digest = hashlib.sha256(f"{study_id(study)} {name} {aux_loss} {environment} {list(seeds)}".encode()).hexdigest()
+    return f"{label}-{digest[:12]}"

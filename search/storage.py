@@ -4,6 +4,7 @@ import json
 import os
 import re
 import sys
+import uuid
 import warnings
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ JOURNAL = "journal.log"
 SQLITE_TIMEOUT = 120
 # Seconds between the signs of life that a worker leaves in a database (paper-sized trials run for hours).
 HEARTBEAT_INTERVAL = 60
+# User attribute of a study.
+ID_KEY = "id"
 
 
 class KernelLock(BaseJournalFileLock):
@@ -113,6 +116,17 @@ def open_storage(where: str | Path, create: bool = True) -> BaseStorage:
         return JournalStorage(JournalFile(path, lock))
     except Exception as error:  # whatever a driver raises
         raise ValueError(f"cannot open the storage {without_password(where)}: {without_password(str(error))}") from None
+
+
+def study_id(study: optuna.Study) -> str:
+    """
+    What tells a study from an earlier one of its name, whose storage was deleted while its folder was kept.
+
+    :param study: The study; it gets its id with the first call
+    """
+    if ID_KEY not in study.user_attrs:
+        study.set_user_attr(ID_KEY, uuid.uuid4().hex)
+    return study.user_attrs[ID_KEY]
 
 
 def without_password(text: str) -> str:

@@ -17,6 +17,7 @@ import pytest
 import yaml
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import RandomSampler
+from optuna.storages import RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl import AuxLoss, SACAux
@@ -440,6 +441,10 @@ def test_ctrl_c_leaves_the_checkpoint_and_another_trial_of_the_place_goes_on(
     assert again.intermediate_values[800] == first.intermediate_values[800]
 
 
+def interrupt(*arguments: Any, **keywords: Any) -> Any:
+    raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize("moment", ["suggest_aux_loss", "train_candidate", "mean_curve"])
 def test_ctrl_c_at_any_moment_is_not_the_candidates_fault(
     moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -447,9 +452,6 @@ def test_ctrl_c_at_any_moment_is_not_the_candidates_fault(
     objective = make_objective(tmp_path)
     sampler = AuxLossSampler(population_size=2, n_random=2, n_prior=0, max_horizon=2, seed=0)
     study = optuna.create_study(direction="maximize", sampler=sampler)
-
-    def interrupt(*arguments: Any, **keywords: Any) -> Any:
-        raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("search.objective.train_candidate", lambda *_, **__: training.TrainingRun([], 0.0))
@@ -468,6 +470,48 @@ def test_procedures_that_do_not_search_train_given_losses(tmp_path: Path) -> Non
     score = objective.train(trial, None, ENV, [2], identity)
     assert trial.user_attrs["loss"] == trial.user_attrs["canonical"] == "none"
     assert score == pytest.approx(np.mean([point[1] for point in trial.user_attrs["curve"]]))
+
+
+def folders(path: Path) -> list[str]:
+    return sorted(curve.parent.parent.name for curve in path.rglob("curve.csv"))
+
+
+def test_trials_of_one_loss_have_folders_of_their_own(tmp_path: Path) -> None:
+    study = make_study(losses=3)  # the first and the last are equal, as TPE may propose them to two workers
+    study.optimize(make_objective(tmp_path), n_trials=3)
+    first, second, third = folders(tmp_path / "runs")
+    assert first.startswith("trial-0-") and second.startswith("trial-1-") and third.startswith("trial-2-")
+
+
+def test_a_heartbeats_copy_of_a_killed_trial_goes_on_in_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study, objective = make_study(), make_objective(tmp_path)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("search.objective.mean_curve", interrupt)
+        study.optimize(objective, n_trials=1)
+    with pytest.warns(optuna.exceptions.ExperimentalWarning):
+        RetryHeartbeatStaleTrialCallback()(study, study.trials[0])
+    begins = trained_steps(monkeypatch)
+    study.optimize(objective, n_trials=1)
+    assert study.trials[1].state == TrialState.COMPLETE
+    assert len(folders(tmp_path / "runs")) == 1 and begins == []  # its training was over
+
+
+def test_a_study_does_not_take_trainings_of_another_one_for_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The storage was deleted, the folder was not: the trainings may be of another version of this program."""
+    begins = trained_steps(monkeypatch)
+    for n_trained in (1, 2):
+        study = make_study()
+        study.optimize(make_objective(tmp_path), n_trials=1)
+        assert len(begins) == len(folders(tmp_path / "runs")) == n_trained
+    assert study.trials[0].state == TrialState.COMPLETE
+
+
+def test_names_that_look_alike_in_a_file_system_have_folders_of_their_own(tmp_path: Path) -> None:
+    objective, study = make_objective(tmp_path), make_study(losses=0)
+    for name in ("SAC", "SAC+", "SAC"):
+        objective.train(study.ask(), None, ENV, [0], {"gamma": 0.9} if name == "SAC+" else {}, name)
+    assert [name[:4] for name in folders(tmp_path / "runs")] == ["sac-"] * 2
+    assert study.trials[0].user_attrs["curve"] == study.trials[2].user_attrs["curve"] != study.trials[1].user_attrs["curve"]
 
 
 def test_a_failure_has_a_cause(tmp_path: Path) -> None:
