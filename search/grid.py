@@ -166,7 +166,7 @@ def scores(study: optuna.Study, cells: Sequence[Cell]) -> pd.DataFrame:
 
 def _enqueue(study: optuna.Study, cells: Sequence[Cell]) -> int:
     """Enqueue the runs that nobody has or had, and those that did not fail too often; how many."""
-    workers.fail_dead(study, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
+    workers.fail_dead(study, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)), all_have_names=True)
     trials = study.get_trials(deepcopy=False)
     there = {_cell_of(trial) for trial in trials if trial.state not in (TrialState.FAIL, TrialState.PRUNED)}
     failures = Counter(

@@ -15,6 +15,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 # User attribute of a trial: the identity of the process that asked for it.
 WORKER_KEY = "worker"
+# A worker gives its name milliseconds after it took a trial; after so many seconds without one it has died in between.
+UNNAMED_SECONDS = 60.0
 
 
 def identity(pid: int | None = None) -> str:
@@ -80,22 +82,26 @@ def fail(study: Study, trial: FrozenTrial, reason: str) -> bool:
         return False
 
 
-def fail_dead(study: Study, trials: Iterable[FrozenTrial]) -> int:
+def fail_dead(study: Study, trials: Iterable[FrozenTrial], all_have_names: bool = False) -> int:
     """
     Fail the running trials whose worker has died on this machine, so that their places are given out again.
 
     :param study: The study
     :param trials: Trials to look at
+    :param all_have_names: Whether all workers of the study give their names, so that one without has died
     :return: How many were failed
     """
     failed = 0
     for trial in trials:
+        if trial.state != TrialState.RUNNING:
+            continue
         worker = trial.user_attrs.get(WORKER_KEY)
-        if trial.state != TrialState.RUNNING or worker is None:
-            continue
-        # A heartbeat's copy of a dead trial begins with the name of the dead worker.
-        started = trial.datetime_start or datetime.now()
-        if "failed_trial" in trial.system_attrs and datetime.now() - started < timedelta(seconds=10):
-            continue
-        failed += is_dead(worker) and fail(study, trial, "its worker died")
+        age = datetime.now() - (trial.datetime_start or datetime.now())
+        if worker is None:
+            died = all_have_names and age > timedelta(seconds=UNNAMED_SECONDS)
+        else:
+            # A heartbeat's copy of a dead trial begins with the name of the dead worker.
+            is_copy = "failed_trial" in trial.system_attrs and age < timedelta(seconds=10)
+            died = not is_copy and is_dead(worker)
+        failed += died and fail(study, trial, "its worker died")
     return failed

@@ -44,6 +44,24 @@ class NoPool:
         return False
 
 
+class SameProcess(NoPool):
+    """Works while it begins."""
+
+    def __init__(self, worker: Callable[..., None], arguments: tuple[Any, ...], *others: object):
+        worker(*arguments)
+
+
+class Stub:
+    """An objective that costs nothing."""
+
+    def __init__(self, *arguments: object):
+        pass
+
+    def train(self, trial: optuna.Trial, *arguments: object) -> float:
+        trial.set_user_attr("curve", [[400, 1.0, 0.0]])
+        return 1.0
+
+
 def test_runs_that_another_program_has_are_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(grid, "POLL_SECONDS", 0.1)
     study = make_study(tmp_path)
@@ -59,6 +77,21 @@ def test_runs_that_another_program_has_are_waited_for(tmp_path: Path, monkeypatc
             study.tell(other, 7.0)
     assert counts == [*[(0, 0)] * 5, (1, 0)]  # waits, and trains nothing a second time
     assert len(study.trials) == 1
+
+
+def test_the_run_of_a_worker_that_died_before_it_gave_its_name_is_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "UNNAMED_SECONDS", 0.5)
+    monkeypatch.setattr(grid, "POLL_SECONDS", 0.1)
+    monkeypatch.setattr(grid, "WorkerPool", SameProcess)
+    monkeypatch.setattr(grid, "Objective", Stub)
+    study = make_study(tmp_path)
+    (cell,) = GRID.cells
+    study.enqueue_trial({}, user_attrs=cell._asdict())
+    study.ask()  # all that it did
+    assert list(grid.run(GRID, tmp_path, str(tmp_path)))[-1] == (1, 1)
+    assert [trial.state for trial in study.trials] == [TrialState.FAIL, TrialState.COMPLETE]
 
 
 def test_runs_that_keep_failing_are_an_error_with_the_last_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,19 +117,7 @@ def test_scores_are_those_of_the_runs_asked_for(tmp_path: Path) -> None:
 def test_what_an_interrupted_grid_left_is_passed_over_until_it_is_asked_for_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Stub:
-        def __init__(self, *arguments: object):
-            pass
-
-        def train(self, trial: optuna.Trial, *arguments: object) -> float:
-            trial.set_user_attr("curve", [[400, 1.0, 0.0]])
-            return 1.0
-
-    class Pool(NoPool):
-        def __init__(self, worker: Callable[..., None], arguments: tuple[Any, ...], *others: object):
-            worker(*arguments)
-
-    monkeypatch.setattr(grid, "WorkerPool", Pool)
+    monkeypatch.setattr(grid, "WorkerPool", SameProcess)
     monkeypatch.setattr(grid, "Objective", Stub)
     monkeypatch.setattr(grid, "POLL_SECONDS", 0.0)
     study = make_study(tmp_path)

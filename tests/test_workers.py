@@ -86,6 +86,17 @@ def test_a_copy_of_a_dead_trial_has_time_to_get_the_name_of_its_new_worker() -> 
     assert [trial.state for trial in study.trials] == [TrialState.RUNNING, TrialState.FAIL]
 
 
+def test_a_worker_that_died_before_it_gave_its_name_is_found_by_the_age_of_its_trial() -> None:
+    study = optuna.create_study()
+    study.ask()
+    study.ask()
+    trials = study.trials
+    trials[1].datetime_start = datetime.now() - timedelta(seconds=workers.UNNAMED_SECONDS + 1)
+    assert workers.fail_dead(study, trials) == 0  # a user's own study, whose workers have no names
+    assert workers.fail_dead(study, trials, all_have_names=True) == 1
+    assert [trial.state for trial in study.trials] == [TrialState.RUNNING, TrialState.FAIL]
+
+
 def test_failing_a_trial_that_has_finished_changes_nothing() -> None:
     study = optuna.create_study()
     trial = study.ask()
