@@ -141,7 +141,8 @@ def search(
     study = optuna.create_study(
         study_name=config.name, storage=storage, sampler=sampler, direction="maximize", load_if_exists=True
     )
-    grid.check_training(config, study)
+    of_all = {"environment": config.environment, "seeds": config.seeds}
+    grid.check_training(study, {"candidates": of_all | grid.training(config, config.environment)})
     progress = look(study, sampler, n_workers)  # refuses a study that was begun with other settings of the sampler
     annotate_study(study, settings(config), provenance())
     lines = baseline_scores(config, storage)

@@ -20,13 +20,13 @@ from search import workers
 from search.config import SearchConfig
 from search.objective import CandidateFailed, Objective
 from search.pool import WorkerPool
-from search.storage import open_storage
+from search.storage import open_storage, study_id
 from search.training import TrainingError
 
 # How often a run is tried that fails, or whose worker dies.
 MAX_TRIES = 3
 POLL_SECONDS = 1.0
-# User attribute of a study: what decides the scores beside the losses.
+# User attribute of a study: what decides the scores, by what is trained.
 TRAINING_KEY = "training"
 
 
@@ -81,29 +81,48 @@ class Grid:
         product = itertools.product(self.seeds, self.environments, self.variants)
         return [Cell(variant, environment, seed) for seed, environment, variant in product]
 
+    @property
+    def trainings(self) -> dict[str, dict[str, Any]]:
+        """What decides the scores, as :func:`check_training` takes it: that of each environment and each variant."""
+        trainings = {environment: training(self.config, environment) for environment in self.environments}
+        for name, variant in self.variants.items():
+            loss = None if variant.aux_loss is None else str(variant.aux_loss.canonical())
+            trainings[name] = {**variant.overrides, "aux_loss": loss}
+        return trainings
 
-def check_training(config: SearchConfig, study: optuna.Study) -> None:
+
+def training(config: SearchConfig, environment: str) -> dict[str, Any]:
+    """
+    What decides the score of a loss and a seed on an environment.
+
+    :param config: The search
+    :param environment: Id of the environment
+    """
+    evaluation = {"checkpoints": config.checkpoints_for(environment), "evaluation_episodes": config.evaluation_episodes}
+    return evaluation | config.hyperparameters_for(environment)
+
+
+def check_training(study: optuna.Study, trainings: Mapping[str, Mapping[str, Any]]) -> None:
     """
     Refuse to go on with a study whose runs were trained in another way: scores could not be compared.
 
-    :param config: The search
-    :param study: Its study
+    :param study: The study
+    :param trainings: What decides the scores, by the name of what is trained; the study may have others, and get more
     :raises ValueError: naming the first setting that differs
     """
-    names = ("environment", "checkpoints", "evaluation_episodes", "seeds")
-    training = {name: getattr(config, name) for name in names} | config.hyperparameters_for(config.environment)
-    training = {name: value for name, value in training.items() if name not in ("n_timesteps", "device")}  # these do not
-    training = json.loads(json.dumps(training))
-    begun = study.user_attrs.get(TRAINING_KEY)
-    if begun is None:
-        study.set_user_attr(TRAINING_KEY, training)
-        return
-    for name in training | begun:
-        if begun.get(name) != training.get(name):
-            raise ValueError(
-                f"study {study.study_name!r} was begun with {name}={begun.get(name)!r}, not {training.get(name)!r}: "
-                "give the file of another search another name"
-            )
+    study_id(study)  # now, before several workers do
+    trainings = json.loads(json.dumps(trainings))
+    begun = study.user_attrs.get(TRAINING_KEY, {})
+    for name, settings in trainings.items():
+        before = begun.setdefault(name, settings)
+        for key in settings | before:
+            if before.get(key) != settings.get(key) and key not in ("n_timesteps", "device"):  # these change no score
+                raise ValueError(
+                    f"study {study.study_name!r} was begun with {key}={before.get(key)!r}, not {settings.get(key)!r} "
+                    f"({name}): give the file of another search another name"
+                )
+    if begun != study.user_attrs.get(TRAINING_KEY):
+        study.set_user_attr(TRAINING_KEY, begun)
 
 
 def run(grid: Grid, folder: Path, where: str, n_workers: int = 1, threads: int | None = None) -> Iterator[tuple[int, int]]:
@@ -120,7 +139,7 @@ def run(grid: Grid, folder: Path, where: str, n_workers: int = 1, threads: int |
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = open_storage(where)
     study = optuna.create_study(study_name=grid.name, storage=storage, direction="maximize", load_if_exists=True)
-    check_training(grid.config, study)
+    check_training(study, grid.trainings)
     _enqueue(study, grid.cells)
     finished, failed = _count(study, grid.cells)
     yield finished, failed

@@ -9,9 +9,10 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from search import grid, workers
-from search.config import SearchConfig
-from search.storage import open_storage
+from sb3_aarl import catalog
+from search import evolve, grid, workers
+from search.config import CrossValidation, SearchConfig
+from search.storage import load_study, open_storage
 from search.training import TrainingError
 
 HYPERPARAMETERS = Path(__file__).parent.parent / "zoo_configs" / "demo.yml"
@@ -144,9 +145,39 @@ def test_what_an_interrupted_grid_left_is_passed_over_until_it_is_asked_for_agai
 def test_a_search_that_trains_otherwise_is_another_one(tmp_path: Path, changed: dict, name: str) -> None:
     (tmp_path / "hyperparameters.yml").write_text("default: {batch_size: 8, policy_kwargs: {net_arch: [8]}}\n")
     values = {**vars(CONFIG), "hyperparameters": tmp_path / "hyperparameters.yml"}
-    study = optuna.create_study(study_name="some")
-    grid.check_training(SearchConfig(**values), study)
-    grid.check_training(SearchConfig(**{**values, "stages": 9, "overrides": {"device": "cpu"}}), study)
+    for accepted in ({}, {"stages": 9}, {"overrides": {"device": "cpu"}}):
+        next(evolve.search(SearchConfig(**{**values, **accepted}), tmp_path, str(tmp_path)))
     with pytest.raises(ValueError, match=f"'some' was begun with {name}="):
-        grid.check_training(SearchConfig(**{**values, **changed}), study)
-    assert study.user_attrs[grid.TRAINING_KEY]["batch_size"] == 8
+        next(evolve.search(SearchConfig(**{**values, **changed}), tmp_path, str(tmp_path)))
+    assert load_study(open_storage(tmp_path), "some").user_attrs[grid.TRAINING_KEY]["candidates"]["batch_size"] == 8
+
+
+OTHER = "dm_control/reacher-easy-v0"
+
+
+def with_checkpoints(*checkpoints: int) -> SearchConfig:
+    """The search, whose cross-validation on the other environment is evaluated there."""
+    return replace(CONFIG, cross_validation=CrossValidation((CONFIG.environment, OTHER), checkpoints={OTHER: checkpoints}))
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [
+        ({"variants": {"SAC": grid.Variant(None, {"gamma": 0.9})}}, r"gamma=None, not 0\.9 \(SAC\)"),
+        ({"variants": {"CURL": grid.Variant(catalog.load("curl"), {"gamma": 0.5})}}, r"gamma=0\.9, not 0\.5 \(CURL\)"),
+        ({"variants": {"CURL": grid.Variant(None, {"gamma": 0.9})}}, r"aux_loss=.*, not None \(CURL\)"),
+        ({"config": with_checkpoints(400, 1600)}, rf"checkpoints=\[400, 1200\], not \[400, 1600\] \({OTHER}\)"),
+        ({"config": replace(CONFIG, evaluation_episodes=3)}, "evaluation_episodes=10, not 3"),
+        ({"config": replace(CONFIG, overrides={"batch_size": 16})}, "batch_size=64, not 16"),
+    ],
+)
+def test_a_grid_whose_runs_were_trained_otherwise_is_another_one(tmp_path: Path, changed: dict, name: str) -> None:
+    variants = {"SAC": grid.Variant(None), "CURL": grid.Variant(catalog.load("curl"), {"gamma": 0.9})}
+    begun = replace(GRID, config=with_checkpoints(400, 1200), variants=variants, environments=[CONFIG.environment, OTHER])
+    grown = replace(
+        begun, variants={**variants, "more": grid.Variant(None)}, environments=[OTHER, "Pendulum-v1"], seeds=[0, 1]
+    )
+    for accepted in (replace(begun, environments=[OTHER]), begun, grown, replace(GRID, config=begun.config)):
+        next(grid.run(accepted, tmp_path, str(tmp_path)))
+    with pytest.raises(ValueError, match=f"'some-grid' was begun with {name}"):
+        next(grid.run(replace(begun, **changed), tmp_path, str(tmp_path)))
