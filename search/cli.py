@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from search.evolve import Progress
-    from search.grid import Grid
+    from search.grid import Cell, Grid
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__.partition("\n")[0])
 console = Console()
@@ -185,8 +185,10 @@ def _stages_line(progress: "Progress") -> str:
     return "; ".join(stages) + best
 
 
-def _train_grid(grid: "Grid", folder: Path, storage: str | None, workers: int, threads: int | None) -> "pd.DataFrame":
-    """Train the runs of a grid that are missing, with a progress bar, and return the scores of all."""
+def _train_grid(
+    grid: "Grid", folder: Path, storage: str | None, workers: int, threads: int | None
+) -> "tuple[pd.DataFrame, dict[Cell, str]]":
+    """Train the runs of a grid that are missing, with a progress bar; scores of all, and what had to be given up."""
     from search import grid as grids
     from search.storage import load_study, open_storage
 
@@ -196,7 +198,32 @@ def _train_grid(grid: "Grid", folder: Path, storage: str | None, workers: int, t
         task = bar.add_task(grid.name, total=n_runs)
         for finished, failed in grids.run(grid, folder, where, workers, threads):
             bar.update(task, completed=finished, description=f"{grid.name}, {failed} failed" if failed else grid.name)
-    return grids.scores(load_study(open_storage(where, create=False), grid.name), grid.cells)
+    study = load_study(open_storage(where, create=False), grid.name)
+    return grids.scores(study, grid.cells), grids.given_up(study, grid.cells)
+
+
+def _compare(runs: "pd.DataFrame", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str) -> "pd.DataFrame | None":
+    """Show a table of what can be compared and return it, None if that is nothing; and show what there is beside it."""
+    from search import cross_validation
+    from search import grid as grids
+
+    compared = grids.comparable(runs)
+    others = runs.drop(compared.index)
+    ranked = None if compared.empty else table(compared)
+    if ranked is not None:
+        _show(ranked, title)
+    if not others.empty:
+        _show(cross_validation.ranking(others), "Not ranked, because runs are missing. AULC of those that are there")
+    return ranked
+
+
+def _stop_if_failed(failures: "dict[Cell, str]") -> None:
+    """Name what is missing in a table; exit code 1."""
+    for cell, reason in failures.items():
+        text = f"Failed: {cell.variant} on {cell.environment}, seed {cell.seed}: {reason}"
+        errors.print(text, style="red", markup=False, highlight=False)
+    if failures:
+        raise typer.Exit(1)
 
 
 def _show(frame: "pd.DataFrame", title: str) -> None:
@@ -206,8 +233,8 @@ def _show(frame: "pd.DataFrame", title: str) -> None:
     for column in frame.columns:
         table.add_column(str(column).removeprefix("dm_control/").removesuffix("-v0"), justify="right", no_wrap=True)
     for name, row in frame.iterrows():
-        cells = (str(int(value)) if column == "runs" else f"{value:.3f}" for column, value in row.items())
-        table.add_row(escape(str(name)), *cells)
+        cells = (f"{value:.0f}" if column == "runs" else f"{value:.3f}" for column, value in row.items())
+        table.add_row(escape(str(name)), *("-" if cell == "nan" else cell for cell in cells))
     console.print(table)
 
 
@@ -217,15 +244,15 @@ def baselines(
 ) -> None:
     """Train the baselines of a search, which the evolution is compared with."""
     with clear_errors():
-        from search import evolve
+        from search import cross_validation, evolve
         from search.config import load_config
 
         settings = load_config(config)
         if not settings.baselines:
             raise ValueError(f"{config} names no baselines")
-        runs = _train_grid(evolve.baselines(settings), run_folder(config, folder), storage, workers, threads)
-        means = runs.groupby("variant")["score"].agg(["mean", "std", "count"]).rename(columns={"count": "runs"})
-        _show(means.sort_values("mean", ascending=False), f"Baselines on {settings.environment}, AULC")
+        runs, failures = _train_grid(evolve.baselines(settings), run_folder(config, folder), storage, workers, threads)
+        _compare(runs, cross_validation.ranking, "Baselines, AULC")
+        _stop_if_failed(failures)
 
 
 @app.command("select-operator")
@@ -238,8 +265,10 @@ def select_operator(
         from search.config import load_config
 
         settings = load_config(config)
-        runs = _train_grid(operator_selection.make_grid(settings), run_folder(config, folder), storage, workers, threads)
-        _show(operator_selection.table(runs), "Normalized returns at the last checkpoint (paper, table 2)")
+        grid = operator_selection.make_grid(settings)
+        runs, failures = _train_grid(grid, run_folder(config, folder), storage, workers, threads)
+        _compare(runs, operator_selection.table, "Normalized returns at the last checkpoint (paper, table 2)")
+        _stop_if_failed(failures)
 
 
 @app.command("cross-validate")
@@ -262,11 +291,12 @@ def cross_validate(
         path = run_folder(config, folder)
         searched = load_study(open_storage(storage or str(path), create=False), study or settings.name)
         grid = cross_validation.make_grid(settings, searched, top)
-        runs = _train_grid(grid, path, storage, workers, threads)
-        table = cross_validation.ranking(runs)
-        _show(table, "Cross-validation, AULC")
-        winner = cross_validation.write_winner(table, path / "winner.yml")
-        console.print(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}", markup=False, soft_wrap=True, highlight=False)
+        runs, failures = _train_grid(grid, path, storage, workers, threads)
+        table = _compare(runs, cross_validation.ranking, "Cross-validation, AULC")
+        if table is not None:
+            winner = cross_validation.write_winner(table, path / "winner.yml")
+            console.print(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}", markup=False, soft_wrap=True, highlight=False)
+        _stop_if_failed(failures)
 
 
 Run = Annotated[

@@ -21,7 +21,6 @@ from search.config import SearchConfig
 from search.objective import CandidateFailed, Objective
 from search.pool import WorkerPool
 from search.storage import open_storage, study_id
-from search.training import TrainingError
 
 # How often a run is tried that fails, or whose worker dies.
 MAX_TRIES = 3
@@ -127,14 +126,14 @@ def check_training(study: optuna.Study, trainings: Mapping[str, Mapping[str, Any
 
 def run(grid: Grid, folder: Path, where: str, n_workers: int = 1, threads: int | None = None) -> Iterator[tuple[int, int]]:
     """
-    Train what the study does not have yet. Yields finished and failed runs about once a second.
+    Train what the study does not have yet. Yields finished and failed runs about once a second. Runs that keep failing
+    are given up, see :func:`given_up`.
 
     :param grid: The runs
     :param folder: Folder of the search, for checkpoints and curves
     :param where: Storage of the search, as for ``open_storage``
     :param n_workers: Number of processes
     :param threads: Threads of each, None for its share of the cores
-    :raises TrainingError: when runs keep failing; the others were trained
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = open_storage(where)
@@ -156,13 +155,8 @@ def run(grid: Grid, folder: Path, where: str, n_workers: int = 1, threads: int |
             running = study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.WAITING))
             finished, failed = _count(study, grid.cells)  # after that: none of these is overlooked
             yield finished, failed
-            if finished == len(grid.cells):
+            if finished == len(grid.cells) or not running:
                 return
-            if not running:
-                failures = study.get_trials(deepcopy=False, states=(TrialState.FAIL,))
-                reasons = [trial.user_attrs.get("reason") for trial in failures if _cell_of(trial) in grid.cells]
-                missing = len(grid.cells) - finished
-                raise TrainingError(f"{missing} runs failed {MAX_TRIES} times; the last reason: {reasons[-1]}")
             time.sleep(POLL_SECONDS)  # the same command runs elsewhere too, and has the last runs
 
 
@@ -181,6 +175,35 @@ def scores(study: optuna.Study, cells: Sequence[Cell]) -> pd.DataFrame:
             rows.append({**cell._asdict(), "score": trial.value, "last": trial.user_attrs["curve"][-1][1]})
     columns = [*Cell._fields, "score", "last"]
     return pd.DataFrame(rows, columns=columns).drop_duplicates(list(Cell._fields))
+
+
+def given_up(study: optuna.Study, cells: Sequence[Cell]) -> dict[Cell, str]:
+    """
+    The runs that failed and were not finished, with the last reason.
+
+    :param study: The study
+    :param cells: Runs of the grid
+    """
+    trials = study.get_trials(deepcopy=False)
+    finished = {_cell_of(trial) for trial in trials if trial.state == TrialState.COMPLETE}
+    reasons: dict[Cell, str] = {}
+    for trial in trials:
+        cell = _cell_of(trial)
+        if trial.state == TrialState.FAIL and cell in cells and cell not in finished:
+            # A database's heartbeat and an interruption give none.
+            reasons[cell] = trial.user_attrs.get("reason") or reasons.get(cell, "its worker died")
+    return reasons
+
+
+def comparable(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    The runs of the variants that have each environment and seed which any variant has. The others can't be ranked: what
+    they lack may be what is hard.
+
+    :param runs: As :func:`scores` gives them
+    """
+    n_pairs = len(runs[["environment", "seed"]].drop_duplicates())
+    return runs[runs.groupby("variant")["variant"].transform("size") == n_pairs]
 
 
 def _enqueue(study: optuna.Study, cells: Sequence[Cell]) -> int:

@@ -4,17 +4,24 @@ import os
 import re
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import optuna
 import pytest
 import yaml
 from optuna.storages import BaseStorage
+from optuna.trial import TrialState
 from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
 from search.cli import ZOO, app
+from search.config import load_config
+from search.cross_validation import make_grid
+from search.grid import MAX_TRIES, Cell, Grid
+from search.space import distributions, loss_to_params
 from search.storage import open_storage
 
 ROOT = Path(__file__).parent.parent
@@ -137,3 +144,88 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(run: str, monkey
     result = runner.invoke(app, ["dashboard", run, "--port", "8123"])
     assert result.exit_code == 0, result.stderr
     assert served == [(["some"], Path("runs/some/artifacts"), "127.0.0.1", 8123)]
+
+
+SEARCH = """
+environment: dm_control/cartpole-balance-v0
+hyperparameters: hyper.yml
+checkpoints: [400, 800]
+evaluation_episodes: 1
+cross_validation:
+  environments: [dm_control/cartpole-balance-v0, dm_control/reacher-easy-v0]
+  seeds: [0, 1]
+  top: 3
+baselines:
+- {name: SAC}
+- {name: Diverges, overrides: {learning_rate: 1.0e+30, learning_starts: 5}}
+"""
+LOSSES = [AuxLoss.parse(text) for text in ("{s_t} -> {s_t+1}", "{s_t} -> {r_t}", "{s_t, a_t} -> {s_t+1}")]
+
+
+@pytest.fixture
+def cross_validation(folder: Path) -> Grid:
+    """That of a finished search; its own study has no runs yet."""
+    (folder / "some.yml").write_text(SEARCH)
+    study = optuna.create_study(study_name="some", storage=open_storage("runs/some"), direction="maximize")
+    for value, loss in enumerate(LOSSES):
+        params = loss_to_params(loss)
+        study.add_trial(optuna.trial.create_trial(value=value, params=params, distributions=distributions(loss.horizon)))
+    return make_grid(load_config("some.yml"), study)
+
+
+def add_runs(grid: Grid, scores: dict[str, float], fails: Callable[[Cell], bool]) -> None:
+    study = optuna.create_study(study_name=grid.name, storage=open_storage("runs/some"), direction="maximize")
+    for cell in grid.cells:
+        if fails(cell):
+            attributes = {**cell._asdict(), "reason": "it burst"}
+            trial = optuna.trial.create_trial(state=TrialState.FAIL, user_attrs=attributes)
+            study.add_trials([trial] * MAX_TRIES)
+        else:
+            score = scores[cell.variant]
+            attributes = {**cell._asdict(), "curve": [[400, score, 0.0], [800, score, 0.0]]}
+            study.add_trial(optuna.trial.create_trial(value=score, user_attrs=attributes))
+
+
+def test_a_cross_validation_with_a_failed_run_ranks_the_others_and_says_so(cross_validation: Grid) -> None:
+    worst, middle, best = map(str, LOSSES)
+    failed = Cell(best, "dm_control/reacher-easy-v0", 1)
+    add_runs(cross_validation, {worst: 1.0, middle: 2.0, best: 3.0}, lambda cell: cell == failed)
+    result = runner.invoke(app, ["cross-validate", "some.yml"])
+    assert result.exit_code == 1
+    ranked, _, others = result.stdout.partition("Not ranked, because runs are missing")
+    assert ranked.index(middle) < ranked.index(worst) and f"│ {best}" not in ranked
+    others = others.partition("Winner")[0]
+    assert re.search(rf"{re.escape(best)}\W+3\.000\W+3\.000\W+3\.000\W+0\.000\W+3 ", others) and middle not in others
+    assert f"Winner: {middle}" in result.stdout
+    assert AuxLoss.from_dict(yaml.safe_load(Path("runs/some/winner.yml").read_text())["aux_loss"]) == LOSSES[1]
+    assert result.stderr.splitlines() == [f"Failed: {best} on dm_control/reacher-easy-v0, seed 1: it burst"]
+
+
+def test_an_environment_on_which_all_fail_is_no_reason_not_to_rank(cross_validation: Grid) -> None:
+    worst, middle, best = map(str, LOSSES)
+    add_runs(cross_validation, {worst: 1.0, middle: 2.0, best: 3.0}, lambda cell: "reacher" in cell.environment)
+    result = runner.invoke(app, ["cross-validate", "some.yml"])
+    assert result.exit_code == 1
+    assert f"Winner: {best}" in result.stdout and "reacher" not in result.stdout and "Not ranked" not in result.stdout
+    assert len(result.stderr.splitlines()) == 6
+
+
+def test_a_cross_validation_without_any_run_has_no_winner(cross_validation: Grid) -> None:
+    add_runs(cross_validation, {}, lambda cell: True)
+    result = runner.invoke(app, ["cross-validate", "some.yml"])
+    assert result.exit_code == 1
+    assert len(result.stderr.splitlines()) == len(cross_validation.cells)
+    assert "Winner" not in result.stdout and not Path("runs/some/winner.yml").exists()
+
+
+def test_a_baseline_that_diverges_does_not_hide_the_others(folder: Path) -> None:
+    (folder / "some.yml").write_text(SEARCH)
+    result = runner.invoke(app, ["baselines", "some.yml"])
+    assert result.exit_code == 1
+    study = optuna.load_study(study_name="some-baselines", storage=open_storage("runs/some"))
+    states = Counter((trial.user_attrs["variant"], trial.state) for trial in study.trials)
+    assert states == {("SAC", TrialState.COMPLETE): 1, ("Diverges", TrialState.FAIL): MAX_TRIES}
+    assert f"{study.best_value:.3f}" in result.stdout
+    reason = [trial.user_attrs["reason"] for trial in study.trials if trial.state == TrialState.FAIL][-1]
+    assert "nan" in reason
+    assert result.stderr.splitlines() == [f"Failed: Diverges on dm_control/cartpole-balance-v0, seed 0: {reason}"]

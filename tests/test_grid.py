@@ -1,11 +1,13 @@
 """Lists of runs as studies: what a second program does, and what an older configuration left."""
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import optuna
+import pandas as pd
 import pytest
 from optuna.trial import TrialState
 
@@ -13,7 +15,6 @@ from sb3_aarl import catalog
 from search import evolve, grid, workers
 from search.config import CrossValidation, SearchConfig
 from search.storage import load_study, open_storage
-from search.training import TrainingError
 
 HYPERPARAMETERS = Path(__file__).parent.parent / "zoo_configs" / "demo.yml"
 CONFIG = SearchConfig(Path("some.yml"), "dm_control/cartpole-balance-v0", HYPERPARAMETERS, (400, 800))
@@ -95,14 +96,27 @@ def test_the_run_of_a_worker_that_died_before_it_gave_its_name_is_trained_again(
     assert [trial.state for trial in study.trials] == [TrialState.FAIL, TrialState.COMPLETE]
 
 
-def test_runs_that_keep_failing_are_an_error_with_the_last_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(grid, "WorkerPool", NoPool)
+def test_runs_that_keep_failing_are_given_up_with_the_last_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grid, "WorkerPool", SameProcess)
+    monkeypatch.setattr(grid, "Objective", Stub)
+    monkeypatch.setattr(grid, "POLL_SECONDS", 0.0)
     study = make_study(tmp_path)
     for number in range(grid.MAX_TRIES):
         attributes = {**GRID.cells[0]._asdict(), "reason": f"reason {number}"}
         study.add_trial(optuna.trial.create_trial(state=TrialState.FAIL, user_attrs=attributes))
-    with pytest.raises(TrainingError, match="1 runs failed 3 times; the last reason: reason 2"):
-        list(grid.run(GRID, tmp_path, str(tmp_path)))
+    two = replace(GRID, seeds=[0, 1])
+    assert list(grid.run(two, tmp_path, str(tmp_path)))[-1] == (1, 3)  # the other one is trained
+    assert grid.given_up(study, two.cells) == {GRID.cells[0]: "reason 2"}
+    assert grid.given_up(study, [two.cells[1]]) == {}
+
+
+def test_variants_are_compared_that_have_all_runs_that_any_has() -> None:
+    cells = [*itertools.product(("all", "also all"), ("a", "b"), (0, 1)), ("some", "a", 0), ("some", "a", 1), ("some", "b", 1)]
+    runs = pd.DataFrame(cells, columns=["variant", "environment", "seed"])
+    assert grid.comparable(runs).equals(runs[:8])
+    assert grid.comparable(runs[8:]).equals(runs[8:])
+    assert grid.comparable(runs[6:]).empty  # each lacks one of the other
+    assert grid.comparable(runs[:0]).empty
 
 
 def test_scores_are_those_of_the_runs_asked_for(tmp_path: Path) -> None:
