@@ -27,6 +27,8 @@ def random_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
     """
     _check_crop(images, size)
     batch, _, height, width = images.shape
+    if height == width == size:
+        return images
     top = th.randint(height - size + 1, (batch,), device=images.device)
     left = th.randint(width - size + 1, (batch,), device=images.device)
     return _cut(images, top, left, size, size)

@@ -45,8 +45,9 @@ class AuxHead(nn.Module):
         self.operator = Operator(loss.operator, loss.negatives, target_dim)
         self.source_offsets = offsets(loss.source_tokens, "s")
         self.target_offsets = offsets(loss.target_tokens, "s")
-        # The observations that a window has to hold, for WindowReplayBuffer.sample_windows.
-        self.offsets = sorted({*self.source_offsets, *self.target_offsets})
+        # The observations that a window has to hold, for WindowReplayBuffer.sample_windows: first the source's, then the
+        # target's. One that both name is there twice, so that images are augmented twice.
+        self.offsets = [*self.source_offsets, *self.target_offsets]
 
     def forward(
         self,
@@ -61,19 +62,29 @@ class AuxHead(nn.Module):
         :param encode: The encoder that is trained, from observations (n, ...) to latent states (n, latent_dim)
         :param encode_target: The momentum encoder; no gradient is kept of it
         """
-        source = self._embed(windows, self.loss.source_tokens, encode)
+        n_source = len(self.source_offsets)
+        source = self._embed(windows, self.loss.source_tokens, slice(n_source), encode)
         with th.no_grad():
-            target = self._embed(windows, self.loss.target_tokens, encode_target)
-        return self.operator(self.predictor(source), target)
+            target = self._embed(windows, self.loss.target_tokens, slice(n_source, None), encode_target)
+        prediction = self.predictor(source).to(target.dtype)
+        with th.autocast(prediction.device.type, enabled=False):
+            return self.operator(prediction, target)
 
-    def _embed(self, windows: WindowSamples, tokens: Iterable[Token], encode: Callable[[PyTorchObs], th.Tensor]) -> th.Tensor:
+    def _embed(
+        self,
+        windows: WindowSamples,
+        tokens: Iterable[Token],
+        places: slice,
+        encode: Callable[[PyTorchObs], th.Tensor],
+    ) -> th.Tensor:
         """Latent states, actions and rewards of the tokens side by side, (batch, d); all states in one encoder pass."""
         tokens = tuple(tokens)
         batch = len(windows.actions)
         parts = []
-        places = [self.offsets.index(offset) for offset in offsets(tokens, "s")]
-        if places:
-            parts.append(encode(_select(windows.observations, places)).reshape(batch, -1))
+        n_states = len(offsets(tokens, "s"))
+        if n_states:
+            latent = encode(_select(windows.observations, places))
+            parts.append(latent.unflatten(0, (n_states, batch)).transpose(0, 1).flatten(start_dim=1))
         parts.append(windows.actions[:, offsets(tokens, "a")].flatten(start_dim=1))
         parts.append(windows.rewards[:, offsets(tokens, "r")].flatten(start_dim=1))
         return th.cat(parts, dim=1)
@@ -89,8 +100,8 @@ def offsets(tokens: Iterable[Token], kind: str) -> list[int]:
     return [token.offset for token in tokens if token.kind == kind]
 
 
-def _select(observations: th.Tensor | dict[str, th.Tensor], places: list[int]) -> PyTorchObs:
-    """Of windows (batch, time, ...) those places in time, as one batch (batch * len(places), ...)."""
+def _select(observations: th.Tensor | dict[str, th.Tensor], places: slice) -> PyTorchObs:
+    """Of windows (batch, time, ...) those places in time, as one batch (places * batch, ...): so they lie in memory."""
     if isinstance(observations, dict):
-        return {key: value[:, places].flatten(end_dim=1) for key, value in observations.items()}
-    return observations[:, places].flatten(end_dim=1)
+        return {key: value.transpose(0, 1)[places].flatten(end_dim=1) for key, value in observations.items()}
+    return observations.transpose(0, 1)[places].flatten(end_dim=1)

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 
@@ -48,16 +49,50 @@ class FrameStore:
     :param shape: Shape of a stacked observation; frames are stacked along its first axis, oldest first
     :param dtype: Data type of observations
     :param stack: Number of frames in an observation
+    :param device: Where the frames lie, as a tensor; None for an array of NumPy's
     """
 
-    def __init__(self, buffer_size: int, n_envs: int, shape: tuple[int, ...], dtype: Any, stack: int):
+    frames: Any
+    final_frames: Any
+
+    def __init__(
+        self,
+        buffer_size: int,
+        n_envs: int,
+        shape: tuple[int, ...],
+        dtype: Any,
+        stack: int,
+        device: th.device | None = None,
+    ):
         if stack < 1 or (stack > 1 and (not shape or shape[0] % stack)):
             raise ValueError(f"frame_stack={stack} does not divide the first axis of observations of shape {shape}")
         self.stack = stack
         self.shape = shape
         self.frame_shape = (shape[0] // stack, *shape[1:]) if stack > 1 else shape
-        self.frames = np.zeros((buffer_size + stack, n_envs, *self.frame_shape), dtype)
-        self.final_frames = np.zeros((0, *self.frame_shape), dtype)
+        self.dtype = np.dtype(dtype)
+        self.device = device
+        self.frames = self._zeros((buffer_size + stack, n_envs, *self.frame_shape))
+        self.final_frames = self._zeros((0, *self.frame_shape))
+
+    def _zeros(self, shape: tuple[int, ...]) -> Any:
+        zeros = np.zeros(shape, self.dtype)
+        return zeros if self.device is None else th.zeros(shape, dtype=th.from_numpy(zeros[:0]).dtype, device=self.device)
+
+    def _here(self, array: np.ndarray) -> Any:
+        """An array, as what indexes the frames and may be written to them."""
+        return array if self.device is None else th.as_tensor(array, device=self.device)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Tensors of a GPU could only be loaded where there is one.
+        arrays = {name: np.asarray(th.as_tensor(getattr(self, name)).cpu()) for name in ("frames", "final_frames")}
+        return {**self.__dict__, **arrays}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({"device": None, **state})
+        self.dtype = self.frames.dtype
+        if self.device is not None and self.device.type == "cuda" and not th.cuda.is_available():
+            self.device = None
+        self.frames, self.final_frames = self._here(self.frames), self._here(self.final_frames)
 
     def split(self, observations: np.ndarray) -> np.ndarray:
         """
@@ -66,9 +101,22 @@ class FrameStore:
         """
         return observations.reshape(len(observations), self.stack, *self.frame_shape)
 
+    def put(self, row: int, frames: np.ndarray) -> None:
+        """
+        :param row: Number of the transition
+        :param frames: Its newest frames, (n_envs, *frame_shape)
+        """
+        self.frames[row % len(self.frames)] = self._here(frames)
+
     def gather(
-        self, newest: np.ndarray, envs: np.ndarray, age: np.ndarray, zero_padded: np.ndarray, final: np.ndarray
-    ) -> np.ndarray:
+        self,
+        newest: np.ndarray,
+        envs: np.ndarray,
+        age: np.ndarray,
+        zero_padded: np.ndarray,
+        final: np.ndarray,
+        crop_size: int | None = None,
+    ) -> Any:
         """
         Stacked observations; all arguments have one shape (...).
 
@@ -77,25 +125,58 @@ class FrameStore:
         :param age: How many frames of the same episode came before the newest one
         :param zero_padded: Whether the stack was filled with zeros when the episode began, not with its first frame
         :param final: Where the newest frame lies aside, -1 where it does not
-        :return: (..., *shape)
+        :param crop_size: Height and width in pixels that each observation is cropped to, at a place of its own, uniform
+            over all; the frames of a stack stay together. None for no crop
+        :return: (..., *shape), an array or a tensor as the frames are
         """
         back = np.arange(self.stack - 1, -1, -1)
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
-        stacked = self.frames[rows, envs[..., None]]
-        if (final >= 0).any():
-            stacked[final >= 0, -1] = self.final_frames[final[final >= 0]]
+        corners = None if crop_size is None else self._random_corners(newest.shape, crop_size)
+        stacked = self._read(self.frames, (rows, np.broadcast_to(envs[..., None], rows.shape)), crop_size, corners)
+        is_final = final >= 0
+        if is_final.any():
+            corners = None if corners is None else corners[:, self._here(is_final), -1:]
+            last = self._read(self.final_frames, (final[is_final][:, None],), crop_size, corners)
+            stacked[self._here(is_final), -1] = last[:, 0]
         before = (back > age[..., None]) & zero_padded[..., None]
         if before.any():
-            stacked[before] = 0
-        return stacked.reshape(*newest.shape, *self.shape)
+            stacked[self._here(before)] = 0
+        shape = self.shape if crop_size is None else (self.shape[0], crop_size, crop_size)
+        return stacked.reshape(*newest.shape, *shape)
 
-    def put_final(self, slot: int, frame: np.ndarray) -> None:
+    def _random_corners(self, shape: tuple[int, ...], crop_size: int) -> th.Tensor:
+        """Top and left of a crop for every observation, the same for all frames of its stack: (2, *shape, stack)."""
+        free = [length - crop_size + 1 for length in self.frame_shape[1:]]
+        corners = th.stack([th.randint(places, (*shape, 1), device=self.device) for places in free])
+        return corners.expand(2, *shape, self.stack)
+
+    def _read(self, frames: Any, index: tuple[np.ndarray, ...], crop_size: int | None, corners: th.Tensor | None) -> Any:
+        """Frames at an index of one shape (...), cropped at the corners (2, ...) or not: (..., *frame_shape)."""
+        if crop_size is None or corners is None:
+            return frames[tuple(map(self._here, index))]
+        channels = self.frame_shape[0]
+        if self.device is not None:
+            pixels = th.arange(crop_size, device=self.device)
+            top, left = corners[..., None, None, None]
+            at = tuple(self._here(part)[..., None, None, None] for part in index)
+            channel = th.arange(channels, device=self.device)[:, None, None]
+            return frames[(*at, channel, top + pixels[:, None], left + pixels)]
+        # Copies of slices: an index of single pixels is several times slower on a CPU.
+        cropped = np.empty((*index[0].shape, channels, crop_size, crop_size), self.dtype)
+        numbers = np.ravel_multi_index(index, frames.shape[: len(index)])
+        flat = frames.reshape(-1, *self.frame_shape)
+        places = zip(numbers.ravel().tolist(), *corners.flatten(start_dim=1).tolist(), strict=True)
+        for to, (number, top, left) in zip(cropped.reshape(-1, *cropped.shape[-3:]), places, strict=True):
+            to[:] = flat[number, :, top : top + crop_size, left : left + crop_size]
+        return cropped
+
+    def put_final(self, slot: int, frame: Any) -> None:
         """Lay an episode's last frame aside; the space for them doubles when it is full."""
         if slot >= len(self.final_frames):
-            longer = np.zeros((max(16, 2 * slot), *self.frame_shape), self.frames.dtype)
+            longer = self._zeros((max(16, 2 * slot), *self.frame_shape))
             longer[: len(self.final_frames)] = self.final_frames
             self.final_frames = longer
-        self.final_frames[slot] = frame
+        self.final_frames[slot] = self._here(frame)
 
 
 class _Observations:
@@ -113,7 +194,7 @@ class _Observations:
         self.following = following
         store = buffer.stores[key]
         self.shape = (buffer.buffer_size, buffer.n_envs, *store.shape)
-        self.dtype = store.frames.dtype
+        self.dtype = store.dtype
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -125,7 +206,7 @@ class _Observations:
         where = np.ogrid[: self.shape[0], : self.shape[1]]
         positions, envs = (part[index[:2]] for part in np.broadcast_arrays(*where))
         observations = self.buffer.gather(self.key, positions, envs, self.following)
-        return observations[(*(slice(None),) * positions.ndim, *index[2:])]
+        return np.asarray(th.as_tensor(observations).cpu())[(*(slice(None),) * positions.ndim, *index[2:])]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:], dtype)
@@ -152,6 +233,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
     :param frame_stack: How many frames the environment stacks along the first axis of an observation, oldest first
         (channels of images, which SB3 puts first); one number, or one for each key of a Dict. At an episode's begin
         the first frame may be repeated (Gymnasium's FrameStackObservation) or zeros may fill up (SB3's VecFrameStack)
+    :param storage_device: Device that holds the observations, such as ``"cuda"``: they are then put together, cropped and
+        handed over there. None for main memory. 100,000 frames of 100 x 100 x 3 bytes take 3 GB
     """
 
     def __init__(
@@ -166,6 +249,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         n_steps: int = 1,
         gamma: float = 0.99,
         frame_stack: int | Mapping[str, int] = 1,
+        storage_device: th.device | str | None = None,
     ):
         if n_steps > 1 and isinstance(observation_space, spaces.Dict):
             raise ValueError(f"n_steps={n_steps}: SB3 has no n-step returns for Dict observations")
@@ -178,14 +262,16 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self.gamma = gamma
 
         parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+        self._image_keys = {key for key, space in parts.items() if is_image_space(space)}
         if isinstance(frame_stack, Mapping) and not set(frame_stack) <= set(parts):
             raise ValueError(f"frame_stack={dict(frame_stack)} names keys that observations do not have: {sorted(parts)}")
+        self.storage_device = None if storage_device is None else get_device(storage_device)
         self.stores: dict[str, FrameStore] = {}
         for key, space in parts.items():
             stack = frame_stack.get(key, 1) if isinstance(frame_stack, Mapping) else frame_stack
             shape = get_obs_shape(space)
             assert isinstance(shape, tuple)
-            self.stores[key] = FrameStore(self.buffer_size, n_envs, shape, space.dtype, stack)
+            self.stores[key] = FrameStore(self.buffer_size, n_envs, shape, space.dtype, stack, self.storage_device)
 
         size = (self.buffer_size, n_envs)
         self.actions = np.zeros((*size, self.action_dim), self._maybe_cast_dtype(action_space.dtype))
@@ -224,7 +310,14 @@ class WindowReplayBuffer(NStepReplayBuffer):
         views = {key: _Observations(self, key, following) for key in self.stores}
         return views if isinstance(self.observation_space, spaces.Dict) else views[""]
 
-    def gather(self, key: str, positions: np.ndarray, envs: np.ndarray, following: bool | np.ndarray = False) -> np.ndarray:
+    def gather(
+        self,
+        key: str,
+        positions: np.ndarray,
+        envs: np.ndarray,
+        following: bool | np.ndarray = False,
+        crop_size: int | None = None,
+    ) -> Any:
         """
         Observations of one key; all arguments broadcast to one shape (...).
 
@@ -232,7 +325,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :param positions: Positions in the buffer
         :param envs: Envs
         :param following: Whether to give the next observation instead
-        :return: (..., *observation shape)
+        :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
+        :return: (..., *observation shape), an array, or a tensor on ``storage_device``
         """
         positions, envs, following = np.broadcast_arrays(positions, envs, following)
         # Positions before self.pos were written in this round of the ring, the others in the round before.
@@ -243,6 +337,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
             self._age[positions, envs] + following,
             self._zero_padded[key][positions, envs],
             np.where(following, self._final_slot[positions, envs], -1),
+            crop_size if key in self._image_keys else None,
         )
 
     def add(  # type: ignore[override]
@@ -279,7 +374,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         for env in np.flatnonzero(starts & ~self._episode_over):
             # A new episode although the old one was not done: its last frame is about to be overwritten.
             self._lay_aside(
-                previous, env, {key: store.frames[row % len(store.frames), env] for key, store in self.stores.items()}
+                previous, env, {key: store.frames[row % len(store.frames), int(env)] for key, store in self.stores.items()}
             )
             self.timeouts[previous, env] = True
 
@@ -287,8 +382,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
             self._free_slots.append(int(self._final_slot[pos, env]))
             self._final_slot[pos, env] = -1
         for key, store in self.stores.items():
-            store.frames[row % len(store.frames)] = store.split(current[key])[:, -1]
-            store.frames[(row + 1) % len(store.frames)] = store.split(following[key])[:, -1]
+            store.put(row, store.split(current[key])[:, -1])
+            store.put(row + 1, store.split(following[key])[:, -1])
             padded = self._zero_padded[key]
             padded[pos] = np.where(starts, zero_padded[key], padded[previous])
         self._age[pos] = np.where(starts, 0, self._age[previous] + 1)
@@ -312,7 +407,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         parts = obs if isinstance(obs, dict) else {"": obs}
         return {key: np.asarray(parts[key]).reshape(self.n_envs, *store.shape) for key, store in self.stores.items()}
 
-    def _lay_aside(self, pos: int, env: np.intp, frames: dict[str, np.ndarray]) -> None:
+    def _lay_aside(self, pos: int, env: np.intp, frames: dict[str, Any]) -> None:
         if not self._free_slots:
             self._free_slots.append(self._n_slots)
             self._n_slots += 1
@@ -336,7 +431,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
                         raise self._stack_error(key, env, "an episode begins neither with one frame repeated nor with zeros")
                     zero_padded[key][env] = True
                 # VecNormalize, whose spaces are always float, gives an episode's last observation back with rounding errors.
-                rounded = done[env] and np.issubdtype(store.frames.dtype, np.floating)
+                rounded = done[env] and np.issubdtype(store.dtype, np.floating)
                 if not rounded and not _equal(new[env, :-1], old[env, 1:]):
                     raise self._stack_error(key, env, "the next observation is not the last one plus one new frame")
         return zero_padded
@@ -350,15 +445,64 @@ class WindowReplayBuffer(NStepReplayBuffer):
             "VecFrameStack outside. If observations are no stacks, pass replay_buffer_kwargs=dict(frame_stack=1)"
         )
 
-    def _get_samples(  # type: ignore[override]
-        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None, crop_size: int | None = None
     ) -> ReplayBufferSamples | DictReplayBufferSamples:
-        # SB3's own code draws from the arrays that this buffer only seems to have.
-        if isinstance(self.observation_space, spaces.Dict):
-            return DictReplayBuffer._get_samples(self, batch_inds, env)  # type: ignore[arg-type]
+        """
+        Transitions, uniform over all; the same as SB3's buffers give for one seed.
+
+        :param batch_size: Number of transitions
+        :param env: VecNormalize that observations and rewards go through; it normalizes whole images, which are not cropped
+        :param crop_size: Height and width in pixels that images are cropped to at random while their frames are gathered,
+            each observation at a place of its own; None for no crop. n-step returns come without crops
+        """
+        upper = self.buffer_size if self.full else self.pos
+        return self._get_samples(np.random.randint(0, upper, size=batch_size), env, crop_size)
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None, crop_size: int | None = None
+    ) -> ReplayBufferSamples | DictReplayBufferSamples:
         if self.n_steps > 1:
+            # SB3's own code draws from the arrays that this buffer only seems to have.
             return super()._get_samples(batch_inds, env)
-        return ReplayBuffer._get_samples(self, batch_inds, env)
+        envs = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        dones = self.dones[batch_inds, envs] * (1 - self.timeouts[batch_inds, envs])
+        samples = DictReplayBufferSamples if isinstance(self.observation_space, spaces.Dict) else ReplayBufferSamples
+        return samples(
+            self._gather_all(batch_inds, envs, False, env, crop_size),
+            self.to_torch(self.actions[batch_inds, envs]),
+            self._gather_all(batch_inds, envs, True, env, crop_size),
+            self.to_torch(dones[:, None]),
+            self.to_torch(self._normalize_reward(self.rewards[batch_inds, envs][:, None], env)),
+        )
+
+    def _gather_all(
+        self,
+        positions: np.ndarray,
+        envs: np.ndarray,
+        following: bool | np.ndarray,
+        env: VecNormalize | None,
+        crop_size: int | None,
+    ) -> Any:
+        """Observations as ``gather`` gives them, of all keys, normalized, on the device."""
+        crop_size = crop_size if env is None else None
+        parts = {key: self.gather(key, positions, envs, following, crop_size) for key in self.stores}
+        if env is not None:
+            parts = {key: np.asarray(th.as_tensor(part).cpu()) for key, part in parts.items()}
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        normalized = self._normalize_obs(parts if is_dict else parts[""], env)
+        if isinstance(normalized, dict):
+            return {key: self.to_torch(value) for key, value in normalized.items()}
+        return self.to_torch(normalized)
+
+    def to_torch(self, array: Any, copy: bool = True) -> th.Tensor:
+        """
+        As in SB3, without the copy: what is drawn here is new anyway.
+
+        :param array: Array or tensor
+        :param copy: Accepted for SB3
+        """
+        return th.as_tensor(array, device=self.device)
 
     def _draw_windows(self, batch_size: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
         """Positions of the last steps, and envs, of windows, uniform over all whole ones."""
@@ -381,6 +525,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         horizon: int,
         env: VecNormalize | None = None,
         offsets: Sequence[int] | None = None,
+        crop_size: int | None = None,
     ) -> WindowSamples:
         """
         Windows of consecutive steps inside one episode of one env, uniform over all whole ones in the buffer.
@@ -388,7 +533,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :param batch_size: Number of windows
         :param horizon: Agent steps k of each: k + 1 observations, the k actions and rewards between them
         :param env: VecNormalize that observations and rewards go through
-        :param offsets: Gather only the observations at these offsets from the start (0 to k); None for all k + 1
+        :param offsets: Gather only the observations at these offsets from the start (0 to k), in this order; None for all
+            k + 1
+        :param crop_size: As in ``sample``; an offset that is named twice gets two crops
         :raises NoWindowError: when no episode is long enough yet
         """
         wanted = np.arange(horizon + 1) if offsets is None else np.asarray(offsets, np.int64)
@@ -398,18 +545,15 @@ class WindowReplayBuffer(NStepReplayBuffer):
         steps = (ends[:, None] + np.arange(1 - horizon, 1)) % self.buffer_size
         # The last observation is the next one of the last step: the episode may have ended there.
         following = wanted == horizon
-        at = steps[:, wanted - following]
-        observations = {key: self.gather(key, at, envs[:, None], following) for key in self.stores}
-        is_dict = isinstance(self.observation_space, spaces.Dict)
-        normalized = self._normalize_obs(observations if is_dict else observations[""], env)
+        # Gathered one offset after the other, so that all observations at some of the offsets lie together.
+        observations = self._gather_all(steps[:, wanted - following].T, envs, following[:, None], env, crop_size)
         rewards = self._normalize_reward(self.rewards[steps, envs[:, None]][..., None], env)
-        # All arrays are new ones already.
         return WindowSamples(
-            {key: self.to_torch(value, copy=False) for key, value in normalized.items()}
-            if isinstance(normalized, dict)
-            else self.to_torch(normalized, copy=False),
-            self.to_torch(self.actions[steps, envs[:, None]], copy=False),
-            self.to_torch(rewards, copy=False),
+            {key: value.transpose(0, 1) for key, value in observations.items()}
+            if isinstance(observations, dict)
+            else observations.transpose(0, 1),
+            self.to_torch(self.actions[steps, envs[:, None]]),
+            self.to_torch(rewards),
         )
 
 

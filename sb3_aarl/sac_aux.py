@@ -3,7 +3,7 @@
 import io
 import pathlib
 import random
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -13,7 +13,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
 from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from sb3_aarl import catalog
 from sb3_aarl.aux_head import AuxHead
 from sb3_aarl.aux_loss import AuxLoss
-from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, detect_frame_stack
+from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
 from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy, image_spaces
 
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
@@ -87,6 +87,8 @@ class SACAux(SAC):
         ``"random_shift"`` by up to 4 pixels, ``"none"``; ``"auto"`` crops if all images are larger than ``crop_size``
         and shifts if not. Vectors are never augmented
     :param crop_size: Height and width in pixels of cropped images, None for 84. Where it is given, images must not be smaller
+    :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16, while parameters, optimizers,
+        Q targets, entropy and losses stay float32. Predictions are made in float32
     :raises ValueError: for arguments that do not fit, with the culprit's name
     """
 
@@ -142,6 +144,7 @@ class SACAux(SAC):
         ent_coef_betas: tuple[float, float] = (0.5, 0.999),
         augmentation: str = "auto",
         crop_size: int | None = None,
+        precision: str = "fp32",
         _init_setup_model: bool = True,
     ):
         super().__init__(
@@ -187,6 +190,7 @@ class SACAux(SAC):
         self.ent_coef_betas = ent_coef_betas
         self.augmentation = augmentation
         self.crop_size = crop_size
+        self.precision = precision
 
         self.aux_head: AuxHead | None = None
         self.aux_optimizer: th.optim.Optimizer | None = None
@@ -209,6 +213,9 @@ class SACAux(SAC):
         for name in ("tau", "encoder_tau"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
+
+        if self.precision not in ("fp32", "bf16"):
+            raise ValueError(f"precision must be fp32 or bf16, not {self.precision!r}")
 
         own_buffer = self.replay_buffer_class in (None, WindowReplayBuffer)
         self._check_replay_buffer_class(own_buffer)
@@ -302,123 +309,150 @@ class SACAux(SAC):
         # Batch norm and dropout of the networks that learn; the target critic stays in evaluation mode.
         self.policy.set_training_mode(True)
         self._update_learning_rates()
+        logs: list[dict[str, th.Tensor]] = []
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            batch, windows = self._draw(batch_size)
+            update_actor = self._n_updates % self.policy_delay == 0
+            update_target = self._n_updates % self.target_update_interval == 0
+            logs.append(self._gradient_step(batch, windows, update_actor, update_target))
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/aux_skipped", self._n_aux_skipped)
+        for name in dict.fromkeys(name for log in logs for name in log):
+            values = th.stack([log[name] for log in logs if name in log]).tolist()
+            self.logger.record(f"train/{name}", np.mean(values))
+
+    def _draw(self, batch_size: int) -> tuple[ReplayBufferSamples, WindowSamples | None]:
+        """
+        What one gradient step learns from, images augmented.
+
+        :param batch_size: Transitions to draw, and windows unless ``aux_batch_size`` is given
+        :return: Transitions, and the windows that the auxiliary loss names; None without one, and as long as no episode
+            is as long as its horizon
+        """
         assert self.replay_buffer is not None
-        losses: dict[str, list[float]] = {}
+        crop: dict[str, Any] = {}
+        if self.policy.crops and isinstance(self.replay_buffer, WindowReplayBuffer):
+            crop["crop_size"] = self.policy.crop_size  # while frames are gathered: augment() finds nothing left to crop
+        env = self._vec_normalize_env
+        batch = self.replay_buffer.sample(batch_size, env=env, **crop)
+        augment: Callable[[Any], Any] = self.policy.augment
+        batch = batch._replace(observations=augment(batch.observations), next_observations=augment(batch.next_observations))
+        if self.aux_head is None:
+            return batch, None
+        assert isinstance(self.replay_buffer, WindowReplayBuffer)
+        horizon, offsets = self.aux_head.loss.horizon, self.aux_head.offsets
+        try:
+            windows = self.replay_buffer.sample_windows(
+                self.aux_batch_size or batch_size, horizon, env=env, offsets=offsets, **crop
+            )
+        except NoWindowError:
+            self._n_aux_skipped += 1
+            return batch, None
+        return batch, windows._replace(observations=augment(windows.observations))
+
+    def _gradient_step(
+        self, batch: ReplayBufferSamples, windows: WindowSamples | None, update_actor: bool, update_target: bool
+    ) -> dict[str, th.Tensor]:
+        """
+        One update of everything.
+
+        :param batch: Transitions
+        :param windows: Windows for the auxiliary loss, None to leave it out
+        :param update_actor: Whether actor and entropy coefficient are updated too
+        :param update_target: Whether the target critic follows
+        :return: What the log shows, scalars by name
+        """
+        logs: dict[str, th.Tensor] = {}
+        # Networks compute in bfloat16 if asked to; what they give, and all that is computed of it, is float32.
+        autocast = th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bf16")
 
         def log(name: str, value: th.Tensor) -> None:
             if not th.isfinite(value).all():
                 raise NonFiniteError(f"{name} is {value.item()} at {self._step_and_loss()}")
-            losses.setdefault(name, []).append(value.item())
+            logs[name] = value.detach().reshape(())
 
-        for _ in range(gradient_steps):
-            self._n_updates += 1
-            update_actor = self._n_updates % self.policy_delay == 0
+        obs, next_obs = batch.observations, batch.next_observations
+        # n-step returns discount by gamma ** n_steps, by less where an episode ended.
+        discounts = self.gamma if batch.discounts is None else batch.discounts
+        if self.use_sde:
+            self.actor.reset_noise()
 
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            obs = self.policy.augment(batch.observations)
-            next_obs = self.policy.augment(batch.next_observations)
-            # n-step returns discount by gamma ** n_steps, by less where an episode ended.
-            discounts = self.gamma if batch.discounts is None else batch.discounts
-            if self.use_sde:
-                self.actor.reset_noise()
-
-            # Entropy coefficient: as in SB3 before the critic, so that all of this step sees one value of it.
-            ent_coef_loss = None
-            if update_actor:
+        # Entropy coefficient: as in SB3 before the critic, so that all of this step sees one value of it.
+        if update_actor:
+            with autocast:
                 actions_pi, log_prob = self.actor.action_log_prob(obs)
-                log_prob = log_prob.reshape(-1, 1)
-            if self.ent_coef_optimizer is not None:
-                assert self.log_ent_coef is not None and isinstance(self.target_entropy, float)
-                ent_coef = self.log_ent_coef.detach().exp()
-                if update_actor:
-                    ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
-                    log("ent_coef_loss", ent_coef_loss)
-                    self.ent_coef_optimizer.zero_grad()
-                    ent_coef_loss.backward()
-                    self.ent_coef_optimizer.step()
-            else:
-                ent_coef = self.ent_coef_tensor
-            log("ent_coef", ent_coef)
-
-            # Critic and, through it, the encoder.
-            with th.no_grad():
-                next_actions, next_log_prob = self.actor.action_log_prob(next_obs)
-                next_latent = self.critic_target.encode(next_obs)
-                next_q, _ = th.cat(self.critic_target.q_values(next_latent, next_actions), dim=1).min(dim=1, keepdim=True)
-                next_q = next_q - ent_coef * next_log_prob.reshape(-1, 1)
-                target_q = batch.rewards + (1 - batch.dones) * discounts * next_q
-            latent = self.critic.encode(obs)
-            q_values = self.critic.q_values(latent, batch.actions)
-            critic_loss = 0.5 * sum(F.mse_loss(q, target_q) for q in q_values)
-            assert isinstance(critic_loss, th.Tensor)
-            log("critic_loss", critic_loss)
-            self.critic.optimizer.zero_grad()
-            if self.joint_optimizer and self.aux_optimizer is not None:
-                self._backward_aux_loss(log, batch_size)
-                critic_loss.backward()  # adds to the encoder's gradient
-                self.critic.optimizer.step()
-                self.aux_optimizer.step()
-            else:
-                critic_loss.backward()
-                self.critic.optimizer.step()
-                if self._backward_aux_loss(log, batch_size):
-                    assert self.aux_optimizer is not None
-                    self.aux_optimizer.step()
-
-            # Actor: the encoder gets no gradient from it.
+            log_prob = log_prob.reshape(-1, 1)
+        if self.ent_coef_optimizer is not None:
+            assert self.log_ent_coef is not None and isinstance(self.target_entropy, float)
+            ent_coef = self.log_ent_coef.detach().exp()
             if update_actor:
+                ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                log("ent_coef_loss", ent_coef_loss)
+                self.ent_coef_optimizer.zero_grad()
+                ent_coef_loss.backward()
+                self.ent_coef_optimizer.step()
+        else:
+            ent_coef = self.ent_coef_tensor
+        log("ent_coef", ent_coef)
+
+        # Critic and, through it, the encoder.
+        with th.no_grad(), autocast:
+            next_actions, next_log_prob = self.actor.action_log_prob(next_obs)
+            next_latent = self.critic_target.encode(next_obs)
+            next_q, _ = th.cat(self.critic_target.q_values(next_latent, next_actions), dim=1).min(dim=1, keepdim=True)
+            next_q = next_q - ent_coef * next_log_prob.reshape(-1, 1)
+            target_q = batch.rewards + (1 - batch.dones) * discounts * next_q
+        with autocast:
+            q_values = self.critic.q_values(self.critic.encode(obs), batch.actions)
+        critic_loss = 0.5 * sum(F.mse_loss(q, target_q) for q in q_values)
+        assert isinstance(critic_loss, th.Tensor)
+        log("critic_loss", critic_loss)
+        self.critic.optimizer.zero_grad()
+        if self.joint_optimizer and self.aux_optimizer is not None:
+            self.aux_optimizer.zero_grad()
+            if windows is not None:
+                self._backward_aux_loss(windows, autocast, log)
+            critic_loss.backward()  # adds to the encoder's gradient
+            self.critic.optimizer.step()
+            self.aux_optimizer.step()
+        else:
+            critic_loss.backward()
+            self.critic.optimizer.step()
+            if windows is not None:
+                assert self.aux_optimizer is not None
+                self.aux_optimizer.zero_grad()
+                self._backward_aux_loss(windows, autocast, log)
+                self.aux_optimizer.step()
+
+        # Actor: neither the encoder nor the critic gets a gradient from it.
+        if update_actor:
+            with autocast:
                 with th.no_grad():
                     latent = self.critic.encode(obs)
                 min_q, _ = th.cat(self.critic.q_values(latent, actions_pi), dim=1).min(dim=1, keepdim=True)
-                actor_loss = (ent_coef * log_prob - min_q).mean()
-                log("actor_loss", actor_loss)
-                self.actor.optimizer.zero_grad()
-                actor_loss.backward()
-                self.actor.optimizer.step()
+            actor_loss = (ent_coef * log_prob - min_q).mean()
+            log("actor_loss", actor_loss)
+            self.actor.optimizer.zero_grad()
+            actor_loss.backward(inputs=self.actor.own_parameters())
+            self.actor.optimizer.step()
 
-            # Target critic, its encoder being the momentum encoder.
-            if self._n_updates % self.target_update_interval == 0:
-                self._update_target()
+        # Target critic, its encoder being the momentum encoder.
+        if update_target:
+            self._update_target()
+        return logs
 
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/aux_skipped", self._n_aux_skipped)
-        for name, values in losses.items():
-            self.logger.record(f"train/{name}", np.mean(values))
-
-    def _backward_aux_loss(self, log: Any, batch_size: int) -> bool:
-        """
-        Leave the gradient of the auxiliary loss, and nothing else, on encoder and head.
-
-        :param log: Function of a name and a scalar
-        :param batch_size: Windows to draw, unless ``aux_batch_size`` is given
-        :return: False if there is no auxiliary loss, or no episode is as long as its horizon yet
-        """
-        if self.aux_head is None:
-            return False
-        assert self.aux_optimizer is not None and isinstance(self.replay_buffer, WindowReplayBuffer)
-        self.aux_optimizer.zero_grad()
-        horizon, offsets = self.aux_head.loss.horizon, self.aux_head.offsets
-        try:
-            windows = self.replay_buffer.sample_windows(
-                self.aux_batch_size or batch_size, horizon, env=self._vec_normalize_env, offsets=offsets
-            )
-        except NoWindowError:
-            self._n_aux_skipped += 1
-            return False
-
-        def encode(observations: PyTorchObs) -> th.Tensor:
-            return self.critic.encode(self.policy.augment(observations))
-
-        def encode_target(observations: PyTorchObs) -> th.Tensor:
-            return self.critic_target.encode(self.policy.augment(observations))
-
-        aux_loss = self.aux_head(windows, encode, encode_target)
+    def _backward_aux_loss(self, windows: WindowSamples, autocast: th.autocast, log: Callable[[str, th.Tensor], None]) -> None:
+        """Add the gradient of the auxiliary loss to encoder and head, which have none yet."""
+        assert self.aux_head is not None and self.aux_optimizer is not None
+        with autocast:
+            aux_loss = self.aux_head(windows, self.critic.encode, self.critic_target.encode)
         log("aux_loss", aux_loss)
         (self.aux_coef * aux_loss).backward()
         trained = self.aux_optimizer.param_groups[0]["params"]
         gradients = [parameter.grad for parameter in trained if parameter.grad is not None]
         log("aux_grad_norm", th.nn.utils.get_total_norm(gradients))
-        return True
 
     def _update_target(self) -> None:
         # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.

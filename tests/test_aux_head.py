@@ -113,7 +113,7 @@ def test_value_and_gradients_against_the_oracle(
         windows.actions.double(),
         windows.rewards.double(),
     )
-    named = [i for i in range(loss.horizon + 1) if loss.source[3 * i] or loss.target[3 * i]]
+    named = [i for mask in (loss.source, loss.target) for i in range(loss.horizon + 1) if mask[3 * i]]
     assert head.offsets == named
 
     trained = [*encoder.parameters(), *head.parameters()]

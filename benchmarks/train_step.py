@@ -1,0 +1,243 @@
+"""
+What one gradient step costs: SACAux beside SB3's SAC with networks of the same widths and the same batch.
+
+All run in one process and take turns, so that what disturbs the machine disturbs all; ratios are medians of the ratios
+within each round. ``state``: observations and actions of Cheetah-Run, batch 512, two hidden layers of 1024, AARL-State.
+``pixels``: three stacked frames of 100 x 100 x 3 cropped to 84 x 84, batch 128, AARL-Pixel. SB3's SAC reads pixels of
+84 x 84 through the same encoder class, so that both do the same convolutions. The replay buffers hold random numbers:
+a gradient step costs the same whatever they mean.
+
+The peak of matrix products is measured in the same process, and every step as a share of it: the floating point operations
+of all matrix products and convolutions, as PyTorch counts them, over what the peak would have done in that time.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from rich.console import Console
+from rich.table import Table
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import configure
+from torch.utils.flop_counter import FlopCounterMode
+
+from sb3_aarl import SACAux
+from sb3_aarl.encoders import PixelEncoder
+from search.provenance import provenance
+
+ACTION_DIM = 6
+STATE_DIM = 17
+EPISODE = 250
+BATCH = {"state": 512, "pixels": 128}
+PARTS = ("drawing", "critic", "actor", "auxiliary", "targets")
+
+
+class RandomEnv(gym.Env):
+    """Spaces of Cheetah-Run; only its spaces are used."""
+
+    def __init__(self, setting: str, size: int):
+        self.action_space = spaces.Box(-1, 1, (ACTION_DIM,), np.float32)
+        if setting == "state":
+            self.observation_space = spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)
+        else:
+            self.observation_space = spaces.Box(0, 255, (9, size, size), np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+
+def fill(model: SAC, transitions: int) -> None:
+    """Random episodes of 250 agent steps, whose stacks are what their frames say."""
+    assert model.replay_buffer is not None
+    rng = np.random.default_rng(0)
+    space = model.observation_space
+    stacked = len(space.shape or ()) == 3
+
+    def frame() -> np.ndarray:
+        if stacked:
+            return rng.integers(0, 256, (3, *space.shape[1:]), np.uint8)  # type: ignore[index]
+        return rng.normal(size=space.shape).astype(np.float32)
+
+    for step in range(transitions):
+        if step % EPISODE == 0:
+            obs = np.concatenate([frame()] * 3) if stacked else frame()
+        next_obs = np.concatenate([obs[3:], frame()]) if stacked else frame()
+        over = np.array([step % EPISODE == EPISODE - 1])
+        action, reward = rng.uniform(-1, 1, (1, ACTION_DIM)), rng.normal(size=1)
+        infos = [{"TimeLimit.truncated": bool(over[0])}]
+        model.replay_buffer.add(obs[None], next_obs[None], action, reward, over, infos)
+        obs = next_obs
+
+
+def sb3(setting: str, device: str) -> SAC:
+    kwargs: dict[str, Any] = {"net_arch": [1024, 1024]}
+    if setting == "pixels":
+        # SB3's own way: one encoder for actor and one for critic, no augmentation, images of the size that convolutions see.
+        kwargs["features_extractor_class"] = PixelEncoder
+    policy = "MlpPolicy" if setting == "state" else "CnnPolicy"
+    return SAC(
+        policy, RandomEnv(setting, 84), batch_size=BATCH[setting], buffer_size=2000, policy_kwargs=kwargs, device=device
+    )
+
+
+def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
+    policy = "MlpPolicy" if setting == "state" else "CnnPolicy"
+    if setting == "pixels":
+        kwargs["replay_buffer_kwargs"] = {"frame_stack": 3, **kwargs.get("replay_buffer_kwargs", {})}
+    return SACAux(policy, RandomEnv(setting, 100), batch_size=BATCH[setting], buffer_size=2000, device=device, **kwargs)
+
+
+def synchronize(device: str) -> None:
+    if device == "cuda":
+        th.cuda.synchronize()
+
+
+def peak(device: str, dtype: th.dtype, batch: int) -> float:
+    """Floating point operations a second of the product that dominates a step: (batch, 1024) x (1024, 1024)."""
+    one, other = th.randn(batch, 1024, device=device).to(dtype), th.randn(1024, 1024, device=device).to(dtype)
+    n = 200 if device == "cuda" else 5
+    seconds = []
+    for _ in range(10):
+        started = time.perf_counter()
+        for _ in range(n):
+            one @ other
+        synchronize(device)
+        seconds.append((time.perf_counter() - started) / n)
+    return 2 * batch * 1024 * 1024 / min(seconds)
+
+
+def flops(model: SAC, steps: int = 4) -> float:
+    """Floating point operations of matrix products and convolutions in one gradient step, the mean of some."""
+    with FlopCounterMode(display=False) as counter:
+        model.train(steps, model.batch_size)
+    return counter.get_total_flops() / steps
+
+
+def parts(model: SACAux, device: str, steps: int) -> dict[str, float]:
+    """Milliseconds that each part of a gradient step takes: each ends when its optimizer has stepped."""
+    seconds = dict.fromkeys(PARTS, 0.0)
+    last = 0.0
+
+    def ends(part: str) -> None:
+        nonlocal last
+        synchronize(device)
+        now = time.perf_counter()
+        seconds[part] += now - last
+        last = now
+
+    def timed(method: Callable, part: str) -> Callable:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            result = method(*args, **kwargs)
+            ends(part)
+            return result
+
+        return call
+
+    optimizers = {"critic": [model.critic.optimizer], "actor": [model.actor.optimizer, model.ent_coef_optimizer]}
+    optimizers["auxiliary"] = [model.aux_optimizer]
+    hooks = [
+        optimizer.register_step_post_hook(lambda *_, part=part: ends(part))
+        for part, some in optimizers.items()
+        for optimizer in some
+        if optimizer is not None
+    ]
+    methods = {"_draw": "drawing", "_update_target": "targets"}
+    for name, part in methods.items():
+        setattr(model, name, timed(getattr(model, name), part))
+    synchronize(device)
+    last = time.perf_counter()
+    model.train(steps, model.batch_size)
+    for hook in hooks:
+        hook.remove()
+    for name in methods:
+        delattr(model, name)
+    return {part: 1e3 * value / steps for part, value in seconds.items()}
+
+
+def measure(setting: str, device: str, variants: dict[str, dict[str, Any]], rounds: int, steps: int) -> list[dict[str, Any]]:
+    models: dict[str, SAC] = {"SB3 SAC": sb3(setting, device)}
+    models |= {name: ours(setting, device, **kwargs) for name, kwargs in variants.items()}
+    for model in models.values():
+        model.set_logger(configure(None, []))
+        fill(model, 2000)
+        model.train(4, model.batch_size)  # allocates, warms up, captures
+    seconds: dict[str, list[float]] = {name: [] for name in models}
+    for _ in range(rounds):
+        for name, model in models.items():
+            synchronize(device)
+            started = time.perf_counter()
+            model.train(steps, model.batch_size)
+            synchronize(device)
+            seconds[name].append((time.perf_counter() - started) / steps)
+    rows = []
+    for name, model in models.items():
+        bf16 = getattr(model, "precision", "fp32") == "bf16"
+        row: dict[str, Any] = {
+            "setting": setting,
+            "algorithm": name,
+            "ms": 1e3 * statistics.median(seconds[name]),
+            "ratio": statistics.median(own / base for own, base in zip(seconds[name], seconds["SB3 SAC"], strict=True)),
+            "rounds_ms": [1e3 * value for value in seconds[name]],
+        }
+        if getattr(model, "compile", None) is None:
+            row["gflop"] = flops(model) / 1e9
+            row["peak_gflops"] = peak(device, th.bfloat16 if bf16 else th.float32, BATCH[setting]) / 1e9
+            row["share_of_peak"] = row["gflop"] / row["peak_gflops"] / (row["ms"] / 1e3)
+            if isinstance(model, SACAux):
+                row["parts_ms"] = parts(model, device, 2 * steps)
+        rows.append(row)
+    return rows
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    columns = ["setting", "algorithm", "ms", "ratio", "GFLOP", "of peak", *PARTS]
+    table = Table(*columns, title="One gradient step (median; ratio to SB3's SAC; parts in ms)")
+    for row in rows:
+        split = row.get("parts_ms", {})
+        table.add_row(
+            row["setting"],
+            row["algorithm"],
+            f"{row['ms']:.1f}" if row["ms"] >= 10 else f"{row['ms']:.3f}",
+            f"{row['ratio']:.3f}",
+            f"{row['gflop']:.1f}" if "gflop" in row else "",
+            f"{row['share_of_peak']:.0%}" if "gflop" in row else "",
+            *(f"{split[part]:.2f}" if split else "" for part in PARTS),
+        )
+    Console(width=160).print(table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--settings", nargs="+", default=["state", "pixels"], choices=["state", "pixels"])
+    parser.add_argument("--device", default="cuda" if th.cuda.is_available() else "cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--steps", type=int, help="gradient steps of each algorithm in a round")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+
+    variants: dict[str, dict[str, Any]] = {
+        "no auxiliary loss": {"aux_loss": None},
+        "fp32": {},
+        "bf16": {"precision": "bf16"},
+    }
+    rows = []
+    for setting in args.settings:
+        steps = args.steps or (200 if args.device == "cuda" else {"state": 6, "pixels": 2}[setting])
+        rows += measure(setting, args.device, variants, args.rounds, steps)
+        show(rows)
+    if args.out:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(json.dumps({**provenance(), "threads": th.get_num_threads(), "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
