@@ -21,7 +21,6 @@ from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env, wrap_env
 from sb3_aarl.policies import SACAuxPolicy
-from search.sampler import AuxLossSampler
 
 # Values in a file, aliases written out.
 LARGEST = 100_000
@@ -424,6 +423,7 @@ def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str)
 
 def _check(config: SearchConfig, where: str) -> None:
     """What a whole search would stumble on after hours."""
+    from search.sampler import AuxLossSampler  # not above: a training alone needs neither Optuna nor scikit-learn
 
     def check(holds: bool, problem: str) -> None:
         if not holds:

@@ -189,7 +189,7 @@ def given_up(study: optuna.Study, cells: Sequence[Cell]) -> dict[Cell, str]:
     reasons: dict[Cell, str] = {}
     for trial in trials:
         cell = _cell_of(trial)
-        if trial.state == TrialState.FAIL and cell in cells and cell not in finished:
+        if cell in cells and cell not in finished and cell is not None and trial.state == TrialState.FAIL:
             # A database's heartbeat and an interruption give none.
             reasons[cell] = trial.user_attrs.get("reason") or reasons.get(cell, "its worker died")
     return reasons

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable
+from configparser import ConfigParser
 from pathlib import Path
 
 import optuna
@@ -51,10 +52,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_train_shows_the_curve_and_says_where_the_model_is(folder: Path) -> None:
     options = ("--config", "hyper.yml", "--evaluations", "2", "--episodes", "1", "--seed", "4", "--out", "here")
+    # As without the extra "search".
+    program = "import sys; sys.modules |= dict.fromkeys(['optuna', 'pandas', 'sklearn']); from search.cli import main; main()"
     command = [
         sys.executable,
-        "-m",
-        "search.cli",
+        "-c",
+        program,
         "train",
         "cartpole-balance",
         "--aux-loss",
@@ -128,8 +131,20 @@ def test_losses_lists_the_whole_catalogue() -> None:
         assert AuxLoss.parse(notation, measure, negatives == "negatives") == loss
 
 
-def test_the_default_file_of_hyperparameters_is_there() -> None:
+def test_the_default_file_of_hyperparameters_is_there_and_belongs_to_what_is_installed() -> None:
     assert (ZOO / "aarl_state.yml").is_file()
+    settings = ConfigParser()
+    settings.read(ROOT / "setup.cfg")
+    data = settings["options.package_data"]
+    installed = {
+        path
+        for package in settings["options"]["packages"].split()
+        for pattern in ("*.py", *data.get(package, "").split())
+        for path in (ROOT / package.replace(".", "/")).glob(pattern)
+    }
+    folders = ("sb3_aarl", "search", "zoo_configs")
+    there = {path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()}
+    assert installed == {path for path in there if "__pycache__" not in path.parts}
 
 
 @pytest.mark.parametrize("run", ["runs/some", "elsewhere/some.yml"])
