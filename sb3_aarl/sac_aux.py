@@ -1,9 +1,11 @@
 """SACAux: Soft Actor-Critic whose encoder is also trained with an auxiliary loss."""
 
 import io
+import logging
 import pathlib
 import random
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,7 +16,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
-from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
+from stable_baselines3.common.utils import FloatSchedule, polyak_update
 from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
 
@@ -22,7 +24,10 @@ from sb3_aarl import catalog
 from sb3_aarl.aux_head import AuxHead
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
+from sb3_aarl.cuda_graph import GraphedStep
 from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy, image_spaces
+
+logger = logging.getLogger(__name__)
 
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
 
@@ -89,6 +94,10 @@ class SACAux(SAC):
     :param crop_size: Height and width in pixels of cropped images, None for 84. Where it is given, images must not be smaller
     :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16, while parameters, optimizers,
         Q targets, entropy and losses stay float32. Predictions are made in float32
+    :param compile: ``"cudagraphs"``: on a GPU, the gradient step is one captured CUDA graph. Elsewhere, or where it cannot be
+        captured, one line of log says so and the step runs as it does with None
+    :param allow_tf32: Whether float32 products and convolutions of the gradient step may use TF32 on a GPU; None for
+        PyTorch's own settings (convolutions only)
     :raises ValueError: for arguments that do not fit, with the culprit's name
     """
 
@@ -145,6 +154,8 @@ class SACAux(SAC):
         augmentation: str = "auto",
         crop_size: int | None = None,
         precision: str = "fp32",
+        compile: str | None = None,
+        allow_tf32: bool | None = None,
         _init_setup_model: bool = True,
     ):
         super().__init__(
@@ -191,7 +202,10 @@ class SACAux(SAC):
         self.augmentation = augmentation
         self.crop_size = crop_size
         self.precision = precision
+        self.compile = compile
+        self.allow_tf32 = allow_tf32
 
+        self._graphed_step: GraphedStep | None = None
         self.aux_head: AuxHead | None = None
         self.aux_optimizer: th.optim.Optimizer | None = None
         self._n_aux_skipped = 0
@@ -216,6 +230,8 @@ class SACAux(SAC):
 
         if self.precision not in ("fp32", "bf16"):
             raise ValueError(f"precision must be fp32 or bf16, not {self.precision!r}")
+        if self.compile not in (None, "cudagraphs"):
+            raise ValueError(f"compile must be None or cudagraphs, not {self.compile!r}")
 
         own_buffer = self.replay_buffer_class in (None, WindowReplayBuffer)
         self._check_replay_buffer_class(own_buffer)
@@ -236,6 +252,26 @@ class SACAux(SAC):
             rate = self.ent_coef_schedule(1)
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=rate, betas=self.ent_coef_betas)
         self._setup_aux_loss(own_buffer)
+        self._graphed_step = None
+        if self.compile is not None:
+            if self.device.type != "cuda":
+                problem = f"needs a CUDA device, not {self.device}"
+            elif not all("capturable" in optimizer.param_groups[0] for optimizer in self._optimizers()):
+                problem = f"needs optimizers that can be captured, as {th.optim.Adam.__name__} can"
+            else:
+                problem = None
+                self._graphed_step = GraphedStep(self._gradient_step)
+            if problem is not None:
+                logger.warning("compile=%r %s: the gradient step runs as without", self.compile, problem)
+
+    def _optimizers(self) -> dict[th.optim.Optimizer, Schedule]:
+        """All optimizers, with the schedules of their learning rates."""
+        optimizers = {self.actor.optimizer: self.lr_schedule, self.critic.optimizer: self.lr_schedule}
+        if self.ent_coef_optimizer is not None:
+            optimizers[self.ent_coef_optimizer] = self.ent_coef_schedule
+        if self.aux_optimizer is not None:
+            optimizers[self.aux_optimizer] = self.encoder_schedule
+        return optimizers
 
     def _check_replay_buffer_class(self, own_buffer: bool) -> None:
         if own_buffer or self.aux_loss is None:
@@ -309,19 +345,26 @@ class SACAux(SAC):
         # Batch norm and dropout of the networks that learn; the target critic stays in evaluation mode.
         self.policy.set_training_mode(True)
         self._update_learning_rates()
+        step = self._graphed_step or self._gradient_step
         logs: list[dict[str, th.Tensor]] = []
         for _ in range(gradient_steps):
             self._n_updates += 1
             batch, windows = self._draw(batch_size)
             update_actor = self._n_updates % self.policy_delay == 0
             update_target = self._n_updates % self.target_update_interval == 0
-            logs.append(self._gradient_step(batch, windows, update_actor, update_target))
+            with self._tf32():
+                logs.append(step(batch, windows, update_actor, update_target))
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/aux_skipped", self._n_aux_skipped)
+        first = self._n_updates - gradient_steps + 1
         for name in dict.fromkeys(name for log in logs for name in log):
-            values = th.stack([log[name] for log in logs if name in log]).tolist()
-            self.logger.record(f"train/{name}", np.mean(values))
+            steps = [first + i for i, log in enumerate(logs) if name in log]
+            values = th.stack([log[name] for log in logs if name in log]).cpu().numpy()
+            if not np.isfinite(values).all():
+                wrong = int(np.flatnonzero(~np.isfinite(values))[0])
+                raise NonFiniteError(f"{name} is {values[wrong]} at {self._step_and_loss(steps[wrong])}")
+            self.logger.record(f"train/{name}", np.mean(values, dtype=np.float64))
 
     def _draw(self, batch_size: int) -> tuple[ReplayBufferSamples, WindowSamples | None]:
         """
@@ -369,8 +412,9 @@ class SACAux(SAC):
         autocast = th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bf16")
 
         def log(name: str, value: th.Tensor) -> None:
-            if not th.isfinite(value).all():
-                raise NonFiniteError(f"{name} is {value.item()} at {self._step_and_loss()}")
+            # On a GPU this would wait for the result in every step: there all are looked at in the end.
+            if value.device.type == "cpu" and not th.isfinite(value).all():
+                raise NonFiniteError(f"{name} is {value.item()} at {self._step_and_loss(self._n_updates)}")
             logs[name] = value.detach().reshape(())
 
         obs, next_obs = batch.observations, batch.next_observations
@@ -464,12 +508,38 @@ class SACAux(SAC):
         polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
     def _update_learning_rates(self) -> None:
-        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         progress = self._current_progress_remaining
-        if self.ent_coef_optimizer is not None:
-            update_learning_rate(self.ent_coef_optimizer, self.ent_coef_schedule(progress))
-        if self.aux_optimizer is not None:
-            update_learning_rate(self.aux_optimizer, self.encoder_schedule(progress))
+        self.logger.record("train/learning_rate", self.lr_schedule(progress))
+        # A CUDA graph repeats every number that it was captured with, unless it is a tensor.
+        graphed = self._graphed_step is not None
+        for optimizer, schedule in self._optimizers().items():
+            for group in optimizer.param_groups:
+                if group.get("capturable", graphed) != graphed:  # of a model that was saved in the other mode
+                    group["capturable"] = graphed
+                    for state in optimizer.state.values():
+                        state["step"] = state["step"].to(self.device)
+                if not graphed:
+                    group["lr"] = schedule(progress)
+                elif isinstance(group["lr"], th.Tensor):
+                    group["lr"].fill_(schedule(progress))
+                else:
+                    group["lr"] = th.tensor(schedule(progress), device=self.device)
+
+    @contextmanager
+    def _tf32(self) -> Iterator[None]:
+        """PyTorch's settings of TF32 as ``allow_tf32`` says."""
+        if self.allow_tf32 is None:
+            yield
+            return
+        backends: tuple[Any, ...] = (th.backends.cuda.matmul, th.backends.cudnn)
+        before = [backend.allow_tf32 for backend in backends]
+        for backend in backends:
+            backend.allow_tf32 = self.allow_tf32
+        try:
+            yield
+        finally:
+            for backend, allowed in zip(backends, before, strict=True):
+                backend.allow_tf32 = allowed
 
     def _store_transition(
         self,
@@ -487,8 +557,8 @@ class SACAux(SAC):
                 self._check_finite("terminal observation", info["terminal_observation"])
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
 
-    def _step_and_loss(self) -> str:
-        return f"gradient step {self._n_updates}, agent step {self.num_timesteps}; auxiliary loss: {self.aux_loss}"
+    def _step_and_loss(self, gradient_step: int) -> str:
+        return f"gradient step {gradient_step}, agent step {self.num_timesteps}; auxiliary loss: {self.aux_loss}"
 
     def _check_finite(self, name: str, values: np.ndarray | dict[str, np.ndarray]) -> None:
         for key, array in values.items() if isinstance(values, dict) else [("", values)]:
@@ -524,7 +594,7 @@ class SACAux(SAC):
             culprit = None if isinstance(error, NonFiniteError) else self._non_finite_parameter()
             if culprit is None:
                 raise
-            raise NonFiniteError(f"{culprit} is not finite at {self._step_and_loss()}") from error
+            raise NonFiniteError(f"{culprit} is not finite at {self._step_and_loss(self._n_updates)}") from error
 
     def _get_random_state(self) -> dict[str, Any]:
         return {
@@ -578,7 +648,7 @@ class SACAux(SAC):
         return None
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "ent_coef_schedule", "encoder_schedule"]
+        return [*super()._excluded_save_params(), "ent_coef_schedule", "encoder_schedule", "_graphed_step"]
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"

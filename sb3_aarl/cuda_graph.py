@@ -1,0 +1,108 @@
+"""A gradient step as CUDA graphs: recorded once, then launched as a whole instead of some hundred kernels one by one."""
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import torch as th
+from torch.distributions import Distribution
+
+logger = logging.getLogger(__name__)
+
+# Steps that CUDA wants to see before it records: they are run as they are, and count like any other.
+WARMUP_STEPS = 3
+
+
+class _Recording(NamedTuple):
+    graph: th.cuda.CUDAGraph
+    inputs: list[th.Tensor]
+    outputs: dict[str, th.Tensor]
+
+
+class GraphedStep:
+    """
+    A function of tensors and flags that changes parameters in place, recorded as one CUDA graph for each combination of
+    flags and shapes. Where it cannot be recorded one line of log says why, and it runs as it is from then on.
+
+    :param step: From nested tuples and dicts of tensors, None, and flags, to scalars by name. It must not wait for the GPU
+    """
+
+    def __init__(self, step: Callable[..., dict[str, th.Tensor]]):
+        self.step = step
+        self.recordings: dict[Hashable, _Recording] = {}
+        self.seen: Counter[Hashable] = Counter()
+        self.stream = th.cuda.Stream()
+        self.works = True
+
+    def __call__(self, *arguments: Any) -> dict[str, th.Tensor]:
+        if not self.works:
+            return self.step(*arguments)
+        key = _key(arguments)
+        self.seen[key] += 1
+        if self.seen[key] <= WARMUP_STEPS:
+            self.stream.wait_stream(th.cuda.current_stream())
+            with th.cuda.stream(self.stream):
+                outputs = self.step(*arguments)
+            th.cuda.current_stream().wait_stream(self.stream)
+            return outputs
+        if key not in self.recordings:
+            try:
+                self.recordings[key] = self._record(arguments)
+            except RuntimeError as error:
+                logger.warning("No CUDA graph, the gradient step runs kernel by kernel: %s", str(error).splitlines()[0])
+                self.works = False
+                self.recordings.clear()
+                return self.step(*arguments)
+        graph, inputs, outputs = self.recordings[key]
+        th._foreach_copy_(inputs, list(_leaves(arguments)))
+        graph.replay()
+        # The next replay writes the outputs anew.
+        return {name: value.clone() for name, value in outputs.items()}
+
+    def _record(self, arguments: tuple[Any, ...]) -> _Recording:
+        static = _map(th.clone, arguments)
+        graph = th.cuda.CUDAGraph()
+        with _unchecked_distributions(), th.cuda.graph(graph):
+            outputs = self.step(*static)
+        return _Recording(graph, list(_leaves(static)), outputs)
+
+
+@contextmanager
+def _unchecked_distributions() -> Iterator[None]:
+    """PyTorch's distributions wait for the GPU to check their parameters, which a recording cannot."""
+    before = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(before)
+
+
+def _map(function: Callable[[th.Tensor], Any], value: Any) -> Any:
+    if isinstance(value, th.Tensor):
+        return function(value)
+    if isinstance(value, dict):
+        return {key: _map(function, part) for key, part in value.items()}
+    if isinstance(value, tuple):
+        parts = [_map(function, part) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value
+
+
+def _leaves(value: Any) -> Iterator[th.Tensor]:
+    if isinstance(value, th.Tensor):
+        yield value
+    elif isinstance(value, (dict, tuple)):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _leaves(part)
+
+
+def _key(value: Any) -> Hashable:
+    """What a recording depends on: flags, which parts are None, and shapes and types of tensors."""
+    if isinstance(value, th.Tensor):
+        return tuple(value.shape), value.dtype
+    if isinstance(value, (dict, tuple)):
+        return tuple(_key(part) for part in (value.values() if isinstance(value, dict) else value))
+    return value
