@@ -111,7 +111,7 @@ Workers = Annotated[int, typer.Option(help="Processes that train at the same tim
 Threads = Annotated[
     int | None,
     typer.Option(
-        help="Threads of each process; small networks are often fastest with 1. Default: its share of the cores.", min=1
+        help="Threads of each process; 1 may be fastest for small networks. Default: its share of the cores.", min=1
     ),
 ]
 SearchFile = Annotated[Path, typer.Argument(help="Configuration of a search, such as zoo_configs/search/demo.yml.")]

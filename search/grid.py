@@ -248,6 +248,9 @@ def _run_worker(grid: Grid, folder: Path, where: str) -> None:
         if cell not in grid.cells:
             raise optuna.TrialPruned("enqueued by a grid that was interrupted, and not part of this one")
         trial.set_user_attr(workers.WORKER_KEY, workers.identity())
+        begun = study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.COMPLETE))
+        if any(_cell_of(other) == cell and other.number < trial.number for other in begun):
+            raise optuna.TrialPruned("two programs that began at the same moment enqueued this run; the other one has it")
         variant = grid.variants[cell.variant]
         train = Objective(grid.config, folder / grid.name).train
         return train(trial, variant.aux_loss, cell.environment, [cell.seed], variant.overrides, cell.variant)

@@ -96,6 +96,26 @@ def test_the_run_of_a_worker_that_died_before_it_gave_its_name_is_trained_again(
     assert [trial.state for trial in study.trials] == [TrialState.FAIL, TrialState.COMPLETE]
 
 
+def test_a_run_that_two_programs_enqueued_at_the_same_moment_is_trained_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(grid, "POLL_SECONDS", 0.1)
+    monkeypatch.setattr(grid, "WorkerPool", SameProcess)
+    monkeypatch.setattr(grid, "Objective", Stub)
+    study = make_study(tmp_path)
+    two = replace(GRID, seeds=[0, 1])
+    for cell in two.cells * 2:
+        study.enqueue_trial({}, user_attrs=cell._asdict())
+    other = study.ask()
+    other.set_user_attr(workers.WORKER_KEY, workers.identity())
+    for finished, _ in grid.run(two, tmp_path, str(tmp_path)):
+        if finished == 1:  # the other program still has its run
+            other.set_user_attr("curve", [[400, 1.0, 0.0]])
+            study.tell(other, 1.0)
+    states = [trial.state for trial in study.trials]
+    assert states == [TrialState.COMPLETE] * 2 + [TrialState.PRUNED] * 2
+
+
 def test_runs_that_keep_failing_are_given_up_with_the_last_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(grid, "WorkerPool", SameProcess)
     monkeypatch.setattr(grid, "Objective", Stub)
