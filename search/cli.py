@@ -110,9 +110,7 @@ Folder = Annotated[
 Workers = Annotated[int, typer.Option(help="Processes that train at the same time.", min=1)]
 Threads = Annotated[
     int | None,
-    typer.Option(
-        help="Threads of each process; 1 may be fastest for small networks. Default: its share of the cores.", min=1
-    ),
+    typer.Option(help="Threads of each process; 1 may be fastest for small networks. Default: its share of the cores.", min=1),
 ]
 SearchFile = Annotated[Path, typer.Argument(help="Configuration of a search, such as zoo_configs/search/demo.yml.")]
 
