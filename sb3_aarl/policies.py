@@ -1,6 +1,7 @@
 """Policies of SACAux: actor, critic and momentum target around one encoder, which belongs to the critic."""
 
-from typing import Any
+from collections.abc import Callable, Collection
+from typing import Any, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -23,6 +24,8 @@ class _CropsImages:
     """Mixin for SB3 models: images that are larger than ``crop_size`` are cropped to their centre before the encoder."""
 
     crop_size: int | None
+    features_extractor: Any
+    image_keys: frozenset[str]
     observation_space: spaces.Space
     normalize_images: bool
 
@@ -31,28 +34,49 @@ class _CropsImages:
 
     def preprocess(self, obs: PyTorchObs) -> PyTorchObs:
         """
-        Crop images to their centre unless the augmentation did so at random; then SB3's preprocessing.
+        Crop images to their centre unless the augmentation did so at random; then as SB3 does.
 
         :param obs: Observations (batch, ...), images as bytes
         """
-        if self.crop_size is not None:
-            size = self.crop_size
-            obs = map_images(obs, self.observation_space, lambda images: center_crop(images, size))
-        return preprocess_obs(obs, self.observation_space, normalize_images=self.normalize_images)
+
+        own = isinstance(self.features_extractor, (PixelEncoder, MultiInputEncoder))
+        layout = th.channels_last if own else th.preserve_format
+
+        def preprocess(images: th.Tensor) -> th.Tensor:
+            if self.crop_size is not None:
+                images = center_crop(images, self.crop_size)
+            if not self.normalize_images:
+                return images
+            if images.dtype.is_floating_point:
+                return images.float() / 255
+            # Scaled in place, in the layout that the encoder's convolutions want: images are the largest tensors there are.
+            return images.to(th.float32, memory_format=layout).div_(255)
+
+        obs = map_images(obs, self.image_keys, preprocess)
+        return preprocess_obs(obs, self.observation_space, normalize_images=False)
 
 
-def map_images(obs: PyTorchObs, space: spaces.Space, function: Any) -> PyTorchObs:
+def map_images(obs: PyTorchObs, image_keys: Collection[str], function: Callable[[th.Tensor], th.Tensor]) -> PyTorchObs:
     """
     Apply a function to all images of an observation.
 
     :param obs: Tensor or dict of tensors (batch, ...)
-    :param space: The observation space, which tells what an image is
+    :param image_keys: Keys of the images; ``""`` for an observation that is no Dict
     :param function: From (batch, channels, height, width) to the same
     """
     if isinstance(obs, dict):
-        assert isinstance(space, spaces.Dict)
-        return {key: function(value) if is_image_space(space[key]) else value for key, value in obs.items()}
-    return function(obs) if is_image_space(space) else obs
+        return {key: function(value) if key in image_keys else value for key, value in obs.items()}
+    return function(obs) if image_keys else obs
+
+
+def read_trunk(features_extractor: BaseFeaturesExtractor, obs: Any) -> th.Tensor:
+    """
+    What actor and critic both read of a shared encoder: all but its projection; all of an encoder that has none.
+
+    :param features_extractor: The encoder
+    :param obs: Preprocessed observations (batch, ...)
+    """
+    return features_extractor.trunk(obs) if isinstance(features_extractor, Encoder) else features_extractor(obs)
 
 
 def full_precision(x: th.Tensor) -> th.Tensor:
@@ -62,6 +86,16 @@ def full_precision(x: th.Tensor) -> th.Tensor:
     :param x: Any floats
     """
     return x.float() if x.dtype == th.bfloat16 else x
+
+
+class Trunk(NamedTuple):
+    """
+    Stands for observations whose encoding is known up to the projection, so that actor and critic need not do it twice.
+
+    :param values: What the trunk of the critic's encoder gave, (batch, trunk_dim)
+    """
+
+    values: th.Tensor
 
 
 class Actor(_CropsImages, SB3Actor):
@@ -87,6 +121,7 @@ class Actor(_CropsImages, SB3Actor):
         super().__init__(*args, **kwargs)
         self.share_features_extractor = share_features_extractor
         self.crop_size = crop_size
+        self.image_keys = frozenset(image_spaces(self.observation_space))
         self.squash_log_std = squash_log_std
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         # An encoder that learns nothing, such as SB3's FlattenExtractor, is read as it is.
@@ -111,11 +146,12 @@ class Actor(_CropsImages, SB3Actor):
         return [parameter for parameter in self.parameters() if parameter not in shared]
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+        if isinstance(obs, Trunk):
+            return self.projection(obs.values.detach())
         if not self.share_features_extractor:
             return super().extract_features(obs, features_extractor)
         with th.no_grad():
-            read = features_extractor.trunk if isinstance(features_extractor, Encoder) else features_extractor
-            trunk = read(self.preprocess(obs))  # type: ignore[arg-type]
+            trunk = read_trunk(features_extractor, self.preprocess(obs))
         return self.projection(trunk)
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
@@ -127,8 +163,8 @@ class Actor(_CropsImages, SB3Actor):
         log_std = low + 0.5 * (high - low) * (th.tanh(self.log_std(latent)) + 1)
         return self.mu(latent), log_std, {}
 
-    def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
-        mean_actions, log_std, kwargs = self.get_action_dist_params(obs)
+    def action_log_prob(self, obs: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
+        mean_actions, log_std, kwargs = self.get_action_dist_params(obs)  # type: ignore[arg-type]
         kwargs = {name: full_precision(value) for name, value in kwargs.items()}
         with th.autocast(mean_actions.device.type, enabled=False):
             return self.action_dist.log_prob_from_params(full_precision(mean_actions), full_precision(log_std), **kwargs)
@@ -145,15 +181,26 @@ class Critic(_CropsImages, ContinuousCritic):
     def __init__(self, *args: Any, crop_size: int | None = None, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.crop_size = crop_size
+        self.image_keys = frozenset(image_spaces(self.observation_space))
 
-    def encode(self, obs: PyTorchObs) -> th.Tensor:
+    def trunk(self, obs: PyTorchObs) -> Trunk:
+        """
+        All of the encoder but its projection; all of it where it has none.
+
+        :param obs: Observations (batch, ...)
+        """
+        return Trunk(read_trunk(self.features_extractor, self.preprocess(obs)))
+
+    def encode(self, obs: PyTorchObs | Trunk) -> th.Tensor:
         """
         Latent states.
 
-        :param obs: Observations (batch, ...)
+        :param obs: Observations (batch, ...), or their trunk
         :return: (batch, features_dim)
         """
-        return full_precision(self.extract_features(obs, self.features_extractor))
+        values = obs.values if isinstance(obs, Trunk) else self.trunk(obs).values
+        is_whole = not isinstance(self.features_extractor, Encoder)
+        return full_precision(values if is_whole else self.features_extractor.project(values))
 
     def q_values(self, latent: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
@@ -213,6 +260,7 @@ class SACAuxPolicy(SACPolicy):
         **kwargs: Any,
     ):
         self.augmentation = resolve_augmentation(augmentation, observation_space, crop_size)
+        self.image_keys = frozenset(image_spaces(observation_space))
         self.crop_size = CROP_SIZE if crop_size is None else crop_size
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
@@ -311,7 +359,7 @@ class SACAuxPolicy(SACPolicy):
                 return augment(times.flatten(end_dim=1)).unflatten(0, times.shape[:2]).transpose(0, 1)
             return random_crop(images, self.crop_size) if self.augmentation == "random_crop" else random_shift(images)
 
-        return obs if self.augmentation == "none" else map_images(obs, self.observation_space, augment)
+        return obs if self.augmentation == "none" else map_images(obs, self.image_keys, augment)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {

@@ -423,10 +423,14 @@ class SACAux(SAC):
         if self.use_sde:
             self.actor.reset_noise()
 
+        # What actor and critic both read of these observations is computed once.
+        with autocast:
+            trunk = self.critic.trunk(obs)
+
         # Entropy coefficient: as in SB3 before the critic, so that all of this step sees one value of it.
         if update_actor:
             with autocast:
-                actions_pi, log_prob = self.actor.action_log_prob(obs)
+                actions_pi, log_prob = self.actor.action_log_prob(trunk if self.actor.share_features_extractor else obs)
             log_prob = log_prob.reshape(-1, 1)
         if self.ent_coef_optimizer is not None:
             assert self.log_ent_coef is not None and isinstance(self.target_entropy, float)
@@ -449,7 +453,7 @@ class SACAux(SAC):
             next_q = next_q - ent_coef * next_log_prob.reshape(-1, 1)
             target_q = batch.rewards + (1 - batch.dones) * discounts * next_q
         with autocast:
-            q_values = self.critic.q_values(self.critic.encode(obs), batch.actions)
+            q_values = self.critic.q_values(self.critic.encode(trunk), batch.actions)
         critic_loss = 0.5 * sum(F.mse_loss(q, target_q) for q in q_values)
         assert isinstance(critic_loss, th.Tensor)
         log("critic_loss", critic_loss)

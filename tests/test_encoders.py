@@ -77,7 +77,7 @@ def test_pixel_encoder_against_naive_convolutions(n_layers: int, n_filters: int,
         step = 2 if layer == 0 else 1
         x = np.stack([[correlate(image, kernel, "valid")[0, ::step, ::step] for kernel in weight] for image in x])
         x = np.maximum(x + bias[None, :, None, None], 0)
-    flat = x.reshape(len(x), -1)
+    flat = np.moveaxis(x, 1, -1).reshape(len(x), -1)  # channels last
     np.testing.assert_allclose(encoder.trunk(observations).detach(), flat, rtol=1e-4, atol=1e-5)
     expected = naive_projection(flat, arrays(encoder.projection), tanh)
     np.testing.assert_allclose(encoder(observations).detach(), expected, rtol=1e-3, atol=1e-4)
@@ -196,7 +196,8 @@ def test_multi_input_encoder_is_its_parts_side_by_side(keys: list[str]) -> None:
     assert [latent.shape[1] for latent in expected] == [5 if kind is PixelEncoder else 4 for kind in kinds]
 
     latents = encoder(observations)
-    assert th.equal(latents, th.cat(expected, dim=1)) and latents.shape == (3, encoder.features_dim)
+    th.testing.assert_close(latents, th.cat(expected, dim=1), rtol=1e-6, atol=1e-6)
+    assert latents.shape == (3, encoder.features_dim)
     trunk = encoder.trunk(observations)
     assert th.equal(trunk, th.cat([part.trunk(x) for part, x in zip(encoder.encoders, inputs, strict=True)], dim=1))
     assert trunk.shape == (3, encoder.trunk_dim)
