@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import optuna
 import pandas as pd
@@ -56,6 +56,37 @@ class Cell(NamedTuple):
     seed: int
 
 
+class Runs(Protocol):
+    """A list of runs, as a study; picklable, because worker processes get it."""
+
+    @property
+    def name(self) -> str:
+        """Name of the study."""
+        ...
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All runs, in the order in which they are begun."""
+        ...
+
+    @property
+    def trainings(self) -> dict[str, dict[str, Any]]:
+        """What decides the scores, as :func:`check_training` takes it."""
+        ...
+
+    def train(self, trial: optuna.Trial, cell: Cell, folder: Path) -> float:
+        """
+        Train one run, or go on with it; the trial gets its learning curve as the user attribute ``curve``.
+
+        :param trial: The run's trial
+        :param cell: The run
+        :param folder: Folder for checkpoints and curves
+        :return: AULC
+        :raises CandidateFailed: when the training fails; the trial has a user attribute ``reason`` then
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Grid:
     """
@@ -89,6 +120,12 @@ class Grid:
             trainings[name] = {**variant.overrides, "aux_loss": loss}
         return trainings
 
+    def train(self, trial: optuna.Trial, cell: Cell, folder: Path) -> float:
+        """Train one run, see :class:`Runs`."""
+        variant = self.variants[cell.variant]
+        train = Objective(self.config, folder / self.name).train
+        return train(trial, variant.aux_loss, cell.environment, [cell.seed], variant.overrides, cell.variant)
+
 
 def training(config: SearchConfig, environment: str) -> dict[str, Any]:
     """
@@ -118,13 +155,13 @@ def check_training(study: optuna.Study, trainings: Mapping[str, Mapping[str, Any
             if before.get(key) != settings.get(key) and key not in ("n_timesteps", "device"):  # these change no score
                 raise ValueError(
                     f"study {study.study_name!r} was begun with {key}={before.get(key)!r}, not {settings.get(key)!r} "
-                    f"({name}): give the file of another search another name"
+                    f"({name}): another search needs a file of another name, another benchmark a folder of its own"
                 )
     if begun != study.user_attrs.get(TRAINING_KEY):
         study.set_user_attr(TRAINING_KEY, begun)
 
 
-def run(grid: Grid, folder: Path, where: str, n_workers: int = 1, threads: int | None = None) -> Iterator[tuple[int, int]]:
+def run(grid: Runs, folder: Path, where: str, n_workers: int = 1, threads: int | None = None) -> Iterator[tuple[int, int]]:
     """
     Train what the study does not have yet. Yields finished and failed runs about once a second. Runs that keep failing
     are given up, see :func:`given_up`.
@@ -233,7 +270,7 @@ def _cell_of(trial: FrozenTrial | optuna.Trial) -> Cell | None:
     return Cell(*(trial.user_attrs[name] for name in Cell._fields))
 
 
-def _run_worker(grid: Grid, folder: Path, where: str) -> None:
+def _run_worker(grid: Runs, folder: Path, where: str) -> None:
     """Train runs while any is left that no worker has begun."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     # Nothing is sampled, all runs are enqueued; and none is pruned, as Optuna's default would.
@@ -251,9 +288,7 @@ def _run_worker(grid: Grid, folder: Path, where: str) -> None:
         begun = study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.COMPLETE))
         if any(_cell_of(other) == cell and other.number < trial.number for other in begun):
             raise optuna.TrialPruned("two programs that began at the same moment enqueued this run; the other one has it")
-        variant = grid.variants[cell.variant]
-        train = Objective(grid.config, folder / grid.name).train
-        return train(trial, variant.aux_loss, cell.environment, [cell.seed], variant.overrides, cell.variant)
+        return grid.train(trial, cell, folder)
 
     while study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
         study.optimize(objective, n_trials=1, catch=(CandidateFailed,))
