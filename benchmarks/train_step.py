@@ -59,13 +59,13 @@ def fill(model: SAC, transitions: int) -> None:
     """Random episodes of 250 agent steps, whose stacks are what their frames say."""
     assert model.replay_buffer is not None
     rng = np.random.default_rng(0)
-    space = model.observation_space
-    stacked = len(space.shape or ()) == 3
+    shape = model.observation_space.shape or ()
+    stacked = len(shape) == 3
 
     def frame() -> np.ndarray:
         if stacked:
-            return rng.integers(0, 256, (3, *space.shape[1:]), np.uint8)  # type: ignore[index]
-        return rng.normal(size=space.shape).astype(np.float32)
+            return rng.integers(0, 256, (3, *shape[1:]), np.uint8)
+        return rng.normal(size=shape).astype(np.float32)
 
     for step in range(transitions):
         if step % EPISODE == 0:
@@ -142,7 +142,10 @@ def parts(model: SACAux, device: str, steps: int) -> dict[str, float]:
 
         return call
 
-    optimizers = {"critic": [model.critic.optimizer], "actor": [model.actor.optimizer, model.ent_coef_optimizer]}
+    optimizers: dict[str, list[th.optim.Optimizer | None]] = {
+        "critic": [model.critic.optimizer],
+        "actor": [model.actor.optimizer, model.ent_coef_optimizer],
+    }
     optimizers["auxiliary"] = [model.aux_optimizer]
     hooks = [
         optimizer.register_step_post_hook(lambda *_, part=part: ends(part))

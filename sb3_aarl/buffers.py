@@ -1,5 +1,7 @@
 """WindowReplayBuffer: windows of consecutive steps out of a replay buffer that stores each frame once."""
 
+import math
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -35,6 +37,10 @@ def _equal(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two arrays are the same; NaN is NaN, so that one in an observation does not look like a new episode."""
     # The plain comparison is much faster, and mostly enough.
     return bool((one == other).all()) or np.array_equal(one, other, equal_nan=True)
+
+
+# Memory that drawn observations used and that others may use again: pieces, and bytes of each at most.
+MAX_SCRATCH, MAX_SCRATCH_BYTES = 8, 2**28
 
 
 class FrameStore:
@@ -73,6 +79,7 @@ class FrameStore:
         self.device = device
         self.frames = self._zeros((buffer_size + stack, n_envs, *self.frame_shape))
         self.final_frames = self._zeros((0, *self.frame_shape))
+        self._scratch: list[np.ndarray] = []
 
     def _zeros(self, shape: tuple[int, ...]) -> Any:
         zeros = np.zeros(shape, self.dtype)
@@ -80,16 +87,17 @@ class FrameStore:
 
     def _here(self, array: np.ndarray) -> Any:
         """An array, as what indexes the frames and may be written to them."""
-        return array if self.device is None else th.as_tensor(array, device=self.device)
+        return array if self.device is None else th.as_tensor(np.ascontiguousarray(array), device=self.device)
 
     def __getstate__(self) -> dict[str, Any]:
-        # Tensors of a GPU could only be loaded where there is one.
-        arrays = {name: np.asarray(th.as_tensor(getattr(self, name)).cpu()) for name in ("frames", "final_frames")}
-        return {**self.__dict__, **arrays}
+        state = {**self.__dict__, "_scratch": []}
+        if self.device is not None:
+            # Tensors of a GPU could only be loaded where there is one.
+            state |= {"frames": self.frames.cpu().numpy(), "final_frames": self.final_frames.cpu().numpy()}
+        return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update({"device": None, **state})
-        self.dtype = self.frames.dtype
+        self.__dict__.update(state)
         if self.device is not None and self.device.type == "cuda" and not th.cuda.is_available():
             self.device = None
         self.frames, self.final_frames = self._here(self.frames), self._here(self.final_frames)
@@ -116,7 +124,7 @@ class FrameStore:
         zero_padded: np.ndarray,
         final: np.ndarray,
         crop_size: int | None = None,
-    ) -> Any:
+    ) -> th.Tensor:
         """
         Stacked observations; all arguments have one shape (...).
 
@@ -127,22 +135,21 @@ class FrameStore:
         :param final: Where the newest frame lies aside, -1 where it does not
         :param crop_size: Height and width in pixels that each observation is cropped to, at a place of its own, uniform
             over all; the frames of a stack stay together. None for no crop
-        :return: (..., *shape), an array or a tensor as the frames are
+        :return: (..., *shape), where the frames lie
         """
         back = np.arange(self.stack - 1, -1, -1)
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
+        numbers = np.ravel_multi_index((rows, np.broadcast_to(envs[..., None], rows.shape)), self.frames.shape[:2])
         corners = None if crop_size is None else self._random_corners(newest.shape, crop_size)
-        stacked = self._read(self.frames, (rows, np.broadcast_to(envs[..., None], rows.shape)), crop_size, corners)
-        is_final = final >= 0
-        if is_final.any():
-            corners = None if corners is None else corners[:, self._here(is_final), -1:]
-            last = self._read(self.final_frames, (final[is_final][:, None],), crop_size, corners)
-            stacked[self._here(is_final), -1] = last[:, 0]
+        stacked = self._read(self.frames, numbers, crop_size, corners)
+        is_final = th.as_tensor(final >= 0, device=self.device)
+        if (final >= 0).any():
+            corners = None if corners is None else corners[:, is_final, -1]
+            stacked[is_final, -1] = self._read(self.final_frames, final[final >= 0], crop_size, corners)
         before = (back > age[..., None]) & zero_padded[..., None]
         if before.any():
-            stacked[self._here(before)] = 0
-        shape = self.shape if crop_size is None else (self.shape[0], crop_size, crop_size)
-        return stacked.reshape(*newest.shape, *shape)
+            stacked[th.as_tensor(before, device=self.device)] = 0
+        return stacked.flatten(newest.ndim, newest.ndim + 1) if self.stack > 1 else stacked.squeeze(newest.ndim)
 
     def _random_corners(self, shape: tuple[int, ...], crop_size: int) -> th.Tensor:
         """Top and left of a crop for every observation, the same for all frames of its stack: (2, *shape, stack)."""
@@ -150,25 +157,47 @@ class FrameStore:
         corners = th.stack([th.randint(places, (*shape, 1), device=self.device) for places in free])
         return corners.expand(2, *shape, self.stack)
 
-    def _read(self, frames: Any, index: tuple[np.ndarray, ...], crop_size: int | None, corners: th.Tensor | None) -> Any:
-        """Frames at an index of one shape (...), cropped at the corners (2, ...) or not: (..., *frame_shape)."""
-        if crop_size is None or corners is None:
-            return frames[tuple(map(self._here, index))]
-        channels = self.frame_shape[0]
-        if self.device is not None:
-            pixels = th.arange(crop_size, device=self.device)
-            top, left = corners[..., None, None, None]
-            at = tuple(self._here(part)[..., None, None, None] for part in index)
-            channel = th.arange(channels, device=self.device)[:, None, None]
-            return frames[(*at, channel, top + pixels[:, None], left + pixels)]
-        # Copies of slices: an index of single pixels is several times slower on a CPU.
-        cropped = np.empty((*index[0].shape, channels, crop_size, crop_size), self.dtype)
-        numbers = np.ravel_multi_index(index, frames.shape[: len(index)])
-        flat = frames.reshape(-1, *self.frame_shape)
-        places = zip(numbers.ravel().tolist(), *corners.flatten(start_dim=1).tolist(), strict=True)
-        for to, (number, top, left) in zip(cropped.reshape(-1, *cropped.shape[-3:]), places, strict=True):
-            to[:] = flat[number, :, top : top + crop_size, left : left + crop_size]
-        return cropped
+    def _read(self, frames: Any, numbers: np.ndarray, crop_size: int | None, corners: th.Tensor | None) -> th.Tensor:
+        """
+        Copies of frames.
+
+        :param frames: (..., *frame_shape)
+        :param numbers: Which ones, counted as they lie in memory, of any shape (...)
+        :param crop_size: Height and width in pixels of a crop of each, None for all of it
+        :param corners: Top and left of the crops, (2, ...)
+        :return: (..., *frame_shape), cropped or not
+        """
+        length = math.prod(self.frame_shape)
+        starts = th.as_tensor(numbers, device=self.device) * length
+        if crop_size is not None and corners is not None:
+            # Of each channel all from its crop's first pixel to its last, pixels beside the crop included, is one piece.
+            channels, height, width = self.frame_shape
+            top, left = corners[..., None]
+            starts = starts[..., None] + th.arange(channels, device=self.device) * height * width + top * width + left
+            length = (crop_size - 1) * width + crop_size
+        memory = th.as_tensor(frames).reshape(-1)
+        pieces = memory.as_strided((len(memory) - length + 1, length), (1, 1))  # one from every place in memory on
+        drawn = self._empty((starts.numel(), length), memory)
+        th.index_select(pieces, 0, starts.flatten(), out=drawn)
+        if crop_size is None:
+            return drawn.view(*starts.shape, *self.frame_shape)
+        drawn = drawn.view(*starts.shape, length)
+        return drawn.as_strided((*starts.shape, crop_size, crop_size), (*drawn.stride()[:-1], width, 1))
+
+    def _empty(self, shape: tuple[int, int], like: th.Tensor) -> th.Tensor:
+        """Memory to write to. On a CPU new memory costs more than copying to it: what nobody looks at is used again."""
+        if like.is_cuda:
+            return like.new_empty(shape)
+        size = math.prod(shape)
+        for array in self._scratch:
+            # Seen from the list, from this loop and from the call: then no tensor that was given out is left.
+            if len(array) >= size and sys.getrefcount(array) == 3:
+                return th.from_numpy(array[:size]).view(shape)
+        array = np.empty(size, self.dtype)
+        if array.nbytes <= MAX_SCRATCH_BYTES:
+            # The smallest first, so that it is what a batch takes which fits.
+            self._scratch = sorted([array, *self._scratch[-MAX_SCRATCH + 1 :]], key=len)
+        return th.from_numpy(array[:size]).view(shape)
 
     def put_final(self, slot: int, frame: Any) -> None:
         """Lay an episode's last frame aside; the space for them doubles when it is full."""
@@ -206,7 +235,7 @@ class _Observations:
         where = np.ogrid[: self.shape[0], : self.shape[1]]
         positions, envs = (part[index[:2]] for part in np.broadcast_arrays(*where))
         observations = self.buffer.gather(self.key, positions, envs, self.following)
-        return np.asarray(th.as_tensor(observations).cpu())[(*(slice(None),) * positions.ndim, *index[2:])]
+        return observations.cpu().numpy()[(*(slice(None),) * positions.ndim, *index[2:])]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:], dtype)
@@ -317,7 +346,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         envs: np.ndarray,
         following: bool | np.ndarray = False,
         crop_size: int | None = None,
-    ) -> Any:
+    ) -> th.Tensor:
         """
         Observations of one key; all arguments broadcast to one shape (...).
 
@@ -326,7 +355,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :param envs: Envs
         :param following: Whether to give the next observation instead
         :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
-        :return: (..., *observation shape), an array, or a tensor on ``storage_device``
+        :return: (..., *observation shape), on ``storage_device``
         """
         positions, envs, following = np.broadcast_arrays(positions, envs, following)
         # Positions before self.pos were written in this round of the ring, the others in the round before.
@@ -488,12 +517,11 @@ class WindowReplayBuffer(NStepReplayBuffer):
         crop_size = crop_size if env is None else None
         parts = {key: self.gather(key, positions, envs, following, crop_size) for key in self.stores}
         if env is not None:
-            parts = {key: np.asarray(th.as_tensor(part).cpu()) for key, part in parts.items()}
-        is_dict = isinstance(self.observation_space, spaces.Dict)
-        normalized = self._normalize_obs(parts if is_dict else parts[""], env)
-        if isinstance(normalized, dict):
-            return {key: self.to_torch(value) for key, value in normalized.items()}
-        return self.to_torch(normalized)
+            arrays: dict[str, Any] = {key: part.cpu().numpy() for key, part in parts.items()}
+            normalized: Any = self._normalize_obs(arrays.get("", arrays), env)
+            parts = normalized if isinstance(normalized, dict) else {"": normalized}
+        tensors = {key: self.to_torch(part) for key, part in parts.items()}
+        return tensors.get("", tensors)
 
     def to_torch(self, array: Any, copy: bool = True) -> th.Tensor:
         """

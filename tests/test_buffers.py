@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, TransformObservation
 from hypothesis import given, settings
@@ -173,11 +174,13 @@ EPISODES = st.lists(
     stack=st.integers(1, 4),
     paddings=st.tuples(*[st.sampled_from(["repeat", "zeros"])] * 4),
     as_dict=st.booleans(),
+    storage=st.sampled_from([None, "cpu"]),
     data=st.data(),
 )
-def test_windows_are_those_of_the_trajectories(episodes, capacity, n_added, stack, paddings, as_dict, data):
+def test_windows_are_those_of_the_trajectories(episodes, capacity, n_added, stack, paddings, as_dict, storage, data):
     n_envs = len(episodes)
-    buffer = make_buffer(capacity * n_envs + data.draw(st.integers(0, n_envs - 1)), n_envs, stack, as_dict)
+    buffer_size = capacity * n_envs + data.draw(st.integers(0, n_envs - 1))
+    buffer = make_buffer(buffer_size, n_envs, stack, as_dict, storage_device=storage)
     assert buffer.buffer_size == capacity
     envs = [trajectory(env, plan, stack, paddings[env], as_dict) for env, plan in enumerate(episodes)]
     histories: list[list[Step]] = [[] for _ in envs]
@@ -288,7 +291,8 @@ IMAGE = spaces.Box(0, 255, (40, 48, 3), np.uint8)
 
 @pytest.mark.parametrize("handle_timeout_termination", [True, False])
 @pytest.mark.parametrize("kind, n_steps", [("image", 1), ("image", 3), ("vector", 1), ("vector", 3), ("dict", 1)])
-def test_samples_are_those_of_sb3(kind, n_steps, handle_timeout_termination):
+@pytest.mark.parametrize("storage", [None, "cpu"])
+def test_samples_are_those_of_sb3(kind, n_steps, handle_timeout_termination, storage):
     as_dict, dtype = kind == "dict", np.float32 if kind == "vector" else np.uint8
     stack = 1 if kind == "vector" else 3
     space = observation_space(stack, as_dict, dtype)
@@ -296,7 +300,7 @@ def test_samples_are_those_of_sb3(kind, n_steps, handle_timeout_termination):
     kwargs: dict[str, Any] = {"n_steps": n_steps, "gamma": 0.9} if n_steps > 1 else {}
     kwargs["handle_timeout_termination"] = handle_timeout_termination
     theirs = sb3_class(50, space, ACTIONS, "cpu", n_envs=3, **kwargs)
-    ours = make_buffer(50, 3, stack, as_dict, dtype, **kwargs)
+    ours = make_buffer(50, 3, stack, as_dict, dtype, storage_device=storage, **kwargs)
     normalize = VecNormalize(DummyVecEnv([lambda: Shown(space)]), norm_obs_keys=["state"] if as_dict else None)
     for rms in normalize.obs_rms.values() if as_dict else [normalize.obs_rms]:
         rms.mean, rms.var = rms.mean + 3, rms.var * 5
@@ -380,8 +384,9 @@ def through_sb3(buffer: WindowReplayBuffer) -> WindowReplayBuffer:
 
 @pytest.mark.parametrize("again", [through_pickle, through_sb3, copy.deepcopy])
 @pytest.mark.parametrize("n_added", [5, 10, 43])
-def test_saved_and_loaded_it_goes_on_as_if_nothing_had_happened(again, n_added):
-    buffer = make_buffer(40, 2, stack=3, as_dict=True)
+@pytest.mark.parametrize("storage", [None, "cpu"])
+def test_saved_and_loaded_it_goes_on_as_if_nothing_had_happened(again, n_added, storage):
+    buffer = make_buffer(40, 2, stack=3, as_dict=True, storage_device=storage)
     envs = [trajectory(env, LIFE[env:], 3, "zeros", True) for env in range(2)]
     for _ in range(n_added):
         buffer.add(*transition([next(env) for env in envs]))
@@ -675,3 +680,106 @@ def test_detected_stacks_fit_what_the_wrappers_give(make_env, expected):
         np.testing.assert_allclose(ours.next_observations, theirs.next_observations, rtol=0, atol=tolerance)
     else:
         assert_same_samples(ours, theirs)
+
+
+# --- Crops ------------------------------------------------------------------------------------------------------------
+
+SIZE, CROP = (9, 11), 6  # 4 x 6 places
+
+
+def image_buffer(stack: int, as_dict: bool = False, **kwargs: Any) -> WindowReplayBuffer:
+    """Random images of two channels, episodes of seven steps, a ring that has gone round."""
+    rng = np.random.default_rng(0)
+    image = spaces.Box(0, 255, (2 * stack, *SIZE), np.uint8)
+    space = spaces.Dict({"camera": image, "state": spaces.Box(-1, 1, (3,), np.float32)}) if as_dict else image
+    frame_stack = {"camera": stack} if as_dict else stack
+    buffer = WindowReplayBuffer(60, space, ACTIONS, "cpu", n_envs=2, frame_stack=frame_stack, **kwargs)
+    for i in range(80):
+        if i % 7 == 0:
+            obs = np.repeat(rng.integers(1, 256, (2, 1, 2, *SIZE), np.uint8), stack, axis=1).reshape(2, *image.shape)
+            state = rng.uniform(-1, 1, (2, 3)).astype(np.float32)
+        following = np.concatenate([obs[:, 2:], rng.integers(1, 256, (2, 2, *SIZE), np.uint8)], axis=1)
+        next_state = rng.uniform(-1, 1, (2, 3)).astype(np.float32)
+        done = np.full(2, i % 7 == 6)
+        rest = (rng.uniform(-1, 1, (2, 2)), rng.normal(size=2), done, [{"TimeLimit.truncated": True}] * 2)
+        if as_dict:
+            buffer.add({"camera": obs, "state": state}, {"camera": following, "state": next_state}, *rest)
+        else:
+            buffer.add(obs, following, *rest)
+        obs, state = following, next_state
+    return buffer
+
+
+def corner_of(crop: np.ndarray, image: np.ndarray) -> tuple[int, int]:
+    """Where in an image a crop was cut out."""
+    places = np.ndindex(SIZE[0] - CROP + 1, SIZE[1] - CROP + 1)
+    (corner,) = [(i, j) for i, j in places if np.array_equal(image[:, i : i + CROP, j : j + CROP], crop)]
+    return corner
+
+
+@pytest.mark.parametrize("storage", [None, "cpu"])
+@pytest.mark.parametrize("stack", [1, 3])
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_crops_are_parts_of_what_is_drawn_without(storage, stack, as_dict):
+    buffer = image_buffer(stack, as_dict, storage_device=storage)
+    corners = []
+    for draw in (buffer.sample, lambda *args, **kwargs: buffer.sample_windows(*args, 4, offsets=[4, 0, 2, 0], **kwargs)):
+        np.random.seed(3)
+        whole = draw(300)
+        np.random.seed(3)
+        cropped = draw(300, crop_size=CROP)
+        for name in ("observations", "next_observations"):
+            if not hasattr(whole, name):
+                continue
+            images, crops = getattr(whole, name), getattr(cropped, name)
+            if as_dict:
+                assert_same(crops["state"], images["state"])
+                images, crops = images["camera"], crops["camera"]
+            assert crops.shape == (*images.shape[:-2], CROP, CROP)
+            pairs = zip(crops.flatten(end_dim=-4).numpy(), images.flatten(end_dim=-4).numpy(), strict=True)
+            found = [corner_of(*pair) for pair in pairs]
+            corners.append(found)
+        assert_same(cropped.actions, whole.actions)
+        assert_same(cropped.rewards, whole.rewards)
+    # Every observation has a place of its own, uniform over all of them: of one transition, of one window's same offset.
+    assert len({tuple(found[:300]) for found in corners}) == len(corners)
+    windows = np.array(corners[-1]).reshape(300, 4, 2)
+    assert (windows[:, 1] != windows[:, 3]).any(axis=1).mean() > 0.8
+    counts = [sum(found.count(place) for found in corners) for place in np.ndindex(4, 6)]
+    assert chisquare(counts).pvalue > 1e-3
+
+
+def test_crops_from_arrays_and_from_tensors_are_the_same():
+    drawn = []
+    for storage in (None, "cpu"):
+        buffer = image_buffer(3, storage_device=storage)
+        np.random.seed(1)
+        th.manual_seed(1)
+        drawn.append([*buffer.sample(50, crop_size=CROP)[:5], *buffer.sample_windows(50, 3, crop_size=CROP)])
+    for one, other in zip(*drawn, strict=True):
+        assert_same(one, other)
+
+
+def test_memory_of_batches_is_used_again_once_nobody_has_them():
+    buffer = image_buffer(3)
+    one = buffer.sample_windows(20, 3, crop_size=CROP).observations
+    before, where = one.clone(), one.data_ptr()
+    for _ in range(10):  # more than there are pieces to use again
+        kept = buffer.sample_windows(20, 3, crop_size=CROP).observations[3]
+        assert kept.data_ptr() != where
+    assert_same(one, before)
+    as_array = one.numpy()
+    del one
+    buffer.sample_windows(20, 3, crop_size=CROP)
+    assert_same(as_array, before)
+    del as_array, kept
+    places = {buffer.sample_windows(20, 3, crop_size=CROP).observations.data_ptr() for _ in range(20)}
+    assert len(places) <= 2
+
+
+def test_normalized_images_are_not_cropped():
+    """VecNormalize's statistics are those of whole images."""
+    space = spaces.Box(0, 255, (2, *SIZE), np.float32)
+    normalize = VecNormalize(DummyVecEnv([lambda: Shown(space)]))
+    buffer = image_buffer(1)
+    assert buffer.sample(5, env=normalize, crop_size=CROP).observations.shape == (5, 2, *SIZE)
