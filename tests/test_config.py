@@ -58,7 +58,7 @@ def test_table_8(task: str, rate: float) -> None:
     assert model.predictor_width == 256
     for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer):
         assert optimizer.param_groups[0]["lr"] == rate
-        assert optimizer.param_groups[0]["betas"] == (0.9, 0.999)
+        assert tuple(optimizer.param_groups[0]["betas"]) == (0.9, 0.999)
         assert type(optimizer) is th.optim.Adam
     assert model.ent_coef_optimizer.param_groups[0]["lr"] == 0.0001
     assert tuple(model.ent_coef_optimizer.param_groups[0]["betas"]) == (0.5, 0.999)
@@ -85,7 +85,7 @@ def test_table_7_during_evolution(task: str, repeat: int) -> None:
     assert model.predictor_width == 256
     for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer):
         assert optimizer.param_groups[0]["lr"] == 0.001
-        assert optimizer.param_groups[0]["betas"] == (0.9, 0.999)
+        assert tuple(optimizer.param_groups[0]["betas"]) == (0.9, 0.999)
         assert type(optimizer) is th.optim.Adam
     assert model.ent_coef_optimizer.param_groups[0]["lr"] == 0.0001
     assert tuple(model.ent_coef_optimizer.param_groups[0]["betas"]) == (0.5, 0.999)

@@ -1,0 +1,190 @@
+"""The variants in zoo_configs: the paper's tables 7 and 8 typed in again, read as we and as RL-Zoo do, built and trained."""
+
+import copy
+import functools
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch as th
+import yaml
+from stable_baselines3.common.logger import Logger
+
+from sb3_aarl import SACAux, catalog, encoders
+from sb3_aarl.envs import env_ids, make_dmc_env
+from search.config import load_hyperparameters
+
+ZOO = Path(__file__).parent.parent / "zoo_configs"
+
+# Table 4: 100K steps above, 1000K below.
+EASY = (
+    *("finger-spin", "finger-turn_hard", "cartpole-swingup", "cartpole-swingup_sparse", "reacher-easy", "cheetah-run"),
+    *("walker-stand", "walker-walk", "walker-run", "ball_in_cup-catch", "fish-upright", "hopper-stand"),
+)
+DIFFICULT = ("quadruped-run", "pendulum-swingup", "hopper-hop", "humanoid-stand", "humanoid-walk", "humanoid-run")
+# Table 3.
+PIXEL = ("finger-spin", "cartpole-swingup", "reacher-easy", "cheetah-run", "walker-walk", "ball_in_cup-catch")
+
+# Encoder, its layers, and the loss of each variant from states; "auto" is SACAux's own, which the file leaves out.
+STATE_VARIANTS: dict[str, tuple[str, int, str | None]] = {
+    "aarl_state": ("dense_mlp", 1, "auto"),
+    "sac_dense_mlp": ("dense_mlp", 1, None),
+    "sac_identity": ("identity", 0, None),
+    "curl_state": ("dense_mlp", 1, "curl"),
+    "aarl_mlp_1": ("mlp", 1, "aarl-state"),
+    "aarl_mlp_4": ("mlp", 4, "aarl-state"),
+    "aarl_dense_mlp_4": ("dense_mlp", 4, "aarl-state"),
+}
+# Loss, whether images are cropped, and the column of table 7.
+PIXEL_VARIANTS: dict[str, tuple[str | None, bool, int]] = {
+    "aarl_pixel_evolution": ("auto", True, 0),
+    "aarl_pixel": ("aarl-pixel", True, 1),
+    "curl_pixel": ("curl", True, 1),
+    "sac_pixel": (None, True, 1),
+    "sac_pixel_no_aug": (None, False, 1),
+}
+VARIANTS = [*STATE_VARIANTS, *PIXEL_VARIANTS]
+
+# What both tables have in common, and what neither has: two hidden layers and the delay of the actor are CURL's.
+COMMON: dict[str, Any] = {
+    "buffer_size": 100_000,
+    "learning_starts": 1000,
+    "ent_coef_betas": (0.5, 0.999),
+    "ent_coef_learning_rate": 1e-4,
+    "tau": 0.01,
+    "target_update_interval": 2,
+    "gamma": 0.99,
+    "ent_coef": "auto_0.1",
+    "policy_delay": 2,
+}
+ADAM = {"net_arch": [1024, 1024], "optimizer_kwargs": {"betas": [0.9, 0.999]}}
+
+
+def with_loss(aux_loss: str | None, auxiliary: dict[str, Any]) -> dict[str, Any]:
+    """The loss, and what only a training with a loss has."""
+    return (
+        auxiliary
+        if aux_loss == "auto"
+        else {"aux_loss": aux_loss}
+        if aux_loss is None
+        else {"aux_loss": aux_loss, **auxiliary}
+    )
+
+
+def table_8(variant: str, task: str) -> dict[str, Any]:
+    encoder, n_layers, aux_loss = STATE_VARIANTS[variant]
+    kwargs = {"features_extractor_kwargs": {"features_dim": 40, "n_layers": n_layers, "width": 40}}  # width: not in the paper
+    return {
+        **COMMON,
+        **with_loss(aux_loss, {"predictor_width": 256}),
+        "policy": "MlpPolicy",
+        "n_timesteps": (1_000_000 if task in DIFFICULT else 100_000) // 4,
+        "env_kwargs": {"action_repeat": 4},
+        "learning_rate": 2e-4 if task == "cheetah-run" else 1e-3,
+        "batch_size": 512,
+        **({} if encoder == "identity" else {"encoder_tau": 0.05}),
+        "policy_kwargs": {**ADAM, "features_extractor_class": encoder, **({} if encoder == "identity" else kwargs)},
+    }
+
+
+def table_7(variant: str, task: str) -> dict[str, Any]:
+    aux_loss, crop, column = PIXEL_VARIANTS[variant]
+    repeat = {"cartpole-swingup": 8, "walker-walk": 2, "finger-spin": 2}.get(task, 4)
+    final = {
+        "encoder_learning_rate": 3e-3 if task in ("cheetah-run", "finger-spin", "walker-walk") else 1e-3,
+        "aux_batch_size": {"walker-walk": 128, "cheetah-run": 256, "finger-spin": 256}.get(task, 512),
+    }
+    auxiliary = final if column else {"encoder_learning_rate": 1e-3, "aux_batch_size": 128}
+    return {
+        **COMMON,
+        **with_loss(aux_loss, {"predictor_width": 256, **auxiliary}),
+        "policy": "CnnPolicy",
+        "n_timesteps": 500_000 // repeat,
+        "env_kwargs": {"pixels": True, "image_size": 100 if crop else 84, "frame_stack": 3, "action_repeat": repeat},
+        **({"augmentation": "random_crop", "crop_size": 84} if crop else {"augmentation": "none"}),
+        "learning_rate": 2e-4 if column and task == "cheetah-run" else 1e-3,
+        "batch_size": 512 if column else 128,
+        "encoder_tau": 0.05,
+        "policy_kwargs": {
+            **ADAM,
+            "features_extractor_class": "pixel",
+            "features_extractor_kwargs": {"features_dim": 50, "n_layers": 4, "n_filters": 32},
+        },
+    }
+
+
+def expected(variant: str, task: str) -> dict[str, Any]:
+    return table_8(variant, task) if variant in STATE_VARIANTS else table_7(variant, task)
+
+
+def tasks_of(variant: str) -> tuple[str, ...]:
+    ablation = STATE_VARIANTS.get(variant, ("", 0, ""))[:2] in (("mlp", 1), ("mlp", 4), ("dense_mlp", 4))
+    return PIXEL if variant in PIXEL_VARIANTS else EASY if ablation else EASY + DIFFICULT
+
+
+def test_the_variants_are_all_there() -> None:
+    assert {path.stem for path in ZOO.glob("*.yml") if not path.stem.startswith("demo")} == set(VARIANTS)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_tables_7_and_8(variant: str) -> None:
+    path = ZOO / f"{variant}.yml"
+    ids = {f"dm_control/{task}-v0": task for task in tasks_of(variant)}
+    assert yaml.safe_load(path.read_text()).keys() == {"default", *ids}
+    assert ids.keys() <= set(env_ids())
+    # The last one is in no table: "Others" there.
+    for env_id, task in {**ids, "dm_control/swimmer-swimmer6-v0": "swimmer-swimmer6"}.items():
+        assert load_hyperparameters(path, env_id) == expected(variant, task), task
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_rl_zoo_reads_the_same(variant: str) -> None:
+    """RL-Zoo takes an environment's entry or the default, merges nothing, and reads 1e-3 as text, as YAML 1.1 has it."""
+    path = ZOO / f"{variant}.yml"
+    entries = yaml.safe_load(path.read_text())
+    for env_id in [*entries.keys() - {"default"}, "dm_control/swimmer-swimmer6-v0"]:
+        entry = entries.get(env_id, entries["default"])
+        entry["ent_coef_betas"] = tuple(entry["ent_coef_betas"])
+        assert entry == load_hyperparameters(path, env_id), env_id
+
+
+@functools.cache
+def shared_env(env_id: str, env_kwargs: tuple[tuple[str, Any], ...]) -> gym.Env:
+    """One environment for all variants that see the same: making them is slow."""
+    return make_dmc_env(env_id, **dict(env_kwargs), fast_rendering=True, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("variant", "task"),
+    [
+        *((variant, task) for variant in STATE_VARIANTS for task in ("cheetah-run", "hopper-stand")),
+        *((variant, "cheetah-run") for variant in PIXEL_VARIANTS),
+    ],
+)
+def test_builds_and_trains(variant: str, task: str) -> None:
+    values = load_hyperparameters(ZOO / f"{variant}.yml", f"dm_control/{task}-v0")
+    env = shared_env(f"dm_control/{task}-v0", tuple(values.pop("env_kwargs").items()))
+    small = {"buffer_size": 30, **({"aux_batch_size": 4} if "aux_batch_size" in values else {})}
+    del values["n_timesteps"]
+    model = SACAux(values.pop("policy"), env, **{**values, **small}, seed=0, device="cpu")
+    model.learn(20)
+    model.set_logger(Logger(None, []))
+    before = copy.deepcopy(model.policy.state_dict())
+
+    model.train(gradient_steps=2, batch_size=4)  # the second one is the actor's
+
+    name = expected(variant, task).get("aux_loss", "aarl-state" if variant in STATE_VARIANTS else "aarl-pixel")
+    assert model.aux_loss == (None if name is None else catalog.load(name))
+    logged = model.logger.name_to_value
+    assert logged["train/aux_skipped"] == 0 and ("train/aux_loss" in logged) is (name is not None)
+    assert all(math.isfinite(value) for value in logged.values())
+    extractor = model.critic.features_extractor
+    assert type(extractor) is encoders.ENCODERS[expected(variant, task)["policy_kwargs"]["features_extractor_class"]]
+    layers = [module for module in extractor.modules() if isinstance(module, (th.nn.Linear, th.nn.Conv2d))]
+    n_layers = STATE_VARIANTS[variant][1] if variant in STATE_VARIANTS else 4
+    assert len(layers) == (n_layers and n_layers + 1)  # and the projection
+    for key, value in model.policy.state_dict().items():
+        assert th.isfinite(value).all()
+        assert not th.equal(value, before[key]), key
