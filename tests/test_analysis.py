@@ -1,0 +1,374 @@
+"""Analysis says what the trials say: against scipy, naive counts, and effects that were planted."""
+
+import re
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import optuna
+import pandas as pd
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from optuna.importance import (
+    FanovaImportanceEvaluator,
+    MeanDecreaseImpurityImportanceEvaluator,
+    PedAnovaImportanceEvaluator,
+)
+from optuna.study import StudyDirection
+from optuna.trial import TrialState, create_trial
+from scipy.spatial.distance import pdist
+
+from sb3_aarl.aux_loss import OPERATORS, AuxLoss
+from sb3_aarl.catalog import published
+from search import analysis
+from search.sampler import AuxLossSampler
+from search.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+
+# Section 3.3, typed in again.
+PATTERNS = {
+    "Forward dynamics": ({"s_t", "a_t"}, {"s_t+1"}),
+    "Inverse dynamics": ({"a_t", "s_t+1"}, {"s_t"}),
+    "Reward prediction": ({"s_t", "a_t"}, {"r_t"}),
+    "Action inference": ({"s_t", "s_t+1"}, {"a_t"}),
+    "State reconstruction": ({"s_t"}, {"s_t"}),
+}
+COUNTS = {
+    "State, n_target > n_source": "s",
+    "Action, n_target > n_source": "a",
+    "Reward, n_target > n_source": "r",
+}
+
+
+def tokens(loss):
+    """Both sets as texts, out of the notation."""
+    source, target = str(loss).split(" -> ")
+    return tuple(set(re.findall(r"[sar]_t(?:\+\d+)?", part)) for part in (source, target))
+
+
+def naive_class(loss, name):
+    source, target = tokens(loss)
+    if name in PATTERNS:
+        return PATTERNS[name][0] <= source and PATTERNS[name][1] <= target
+    n_source, n_target = (sum(token[0] == COUNTS[name] for token in side) for side in (source, target))
+    return None if n_source == n_target else n_target > n_source
+
+
+@st.composite
+def losses(draw, max_horizon=3):
+    horizon = draw(st.integers(1, max_horizon))
+    bits = st.lists(st.booleans(), min_size=3 * horizon + 1, max_size=3 * horizon + 1)
+    source = draw(bits.filter(lambda mask: any(mask[::3])))
+    return AuxLoss(
+        horizon, tuple(source), tuple(draw(bits.filter(any))), draw(st.sampled_from(OPERATORS)), draw(st.booleans())
+    )
+
+
+def make_trial(loss, value=None, state=TrialState.COMPLETE, operators=None, **attrs):
+    params = {} if loss is None else loss_to_params(loss, operators)
+    space = {} if loss is None else distributions(loss.horizon, operators=operators)
+    return create_trial(state=state, value=value, params=params, distributions=space, user_attrs=attrs)
+
+
+def in_study(trials):
+    study = optuna.create_study(direction="maximize")
+    study.add_trials(trials)
+    return study.get_trials(deepcopy=False)
+
+
+# What the planted scores are made of.
+EFFECTS = {"Forward dynamics": 40.0, "State, n_target > n_source": 60.0, "Reward prediction": -50.0}
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """800 candidates with planted effects, among them trials of every other kind; the table, and the candidates."""
+    rng = np.random.default_rng(0)
+    candidates = []
+    for _ in range(800):
+        loss = random_loss(rng, 3)
+        effect = sum(size for name, size in EFFECTS.items() if naive_class(loss, name))
+        candidates.append((loss, 100 + effect + rng.normal(0, 20)))
+    trials = [make_trial(loss, value, stage=1 + i // 200) for i, (loss, value) in enumerate(candidates)]
+    loss = candidates[0][0]
+    others = [
+        *(make_trial(loss, state=TrialState.FAIL, stage=2) for _ in range(4)),
+        *(make_trial(loss, 1e9, state=TrialState.PRUNED, stage=2) for _ in range(3)),
+        *(make_trial(loss, state=TrialState.RUNNING, stage=3) for _ in range(2)),
+        make_trial(None, state=TrialState.RUNNING),
+        make_trial(None, state=TrialState.WAITING),
+        make_trial(loss, np.inf),
+        make_trial(None, 5.0),
+    ]
+    return analysis.trial_table(in_study([*trials[:300], *others, *trials[300:]])), candidates
+
+
+def test_paper_example_of_the_rule():
+    loss = AuxLoss.parse("{s_t, a_t} -> {s_t+1, s_t+2}")
+    assert analysis.has_pattern(loss, AuxLoss.parse("{s_t, a_t} -> {s_t+1}"))
+    assert not analysis.has_pattern(loss, AuxLoss.parse("{a_t, s_t+1} -> {s_t}"))
+    assert not analysis.has_pattern(AuxLoss.parse("{s_t+1, a_t+1} -> {s_t+2}"), AuxLoss.parse("{s_t, a_t} -> {s_t+1}"))
+
+
+@given(losses(), losses(max_horizon=2))
+def test_rule_is_that_of_sets(loss, pattern):
+    (source, target), (pattern_source, pattern_target) = tokens(loss), tokens(pattern)
+    assert analysis.has_pattern(loss, pattern) == (pattern_source <= source and pattern_target <= target)
+
+
+@given(losses())
+def test_rule_is_an_order(loss):
+    """Every loss has itself as a pattern, whatever its operator; with fewer tokens on one side it has the larger no more."""
+    assert analysis.has_pattern(loss, replace(loss, operator="mse", negatives=False))
+    more = replace(loss, source=(True,) * len(loss.source), target=(True,) * len(loss.target))
+    assert analysis.has_pattern(more, loss)
+    assert analysis.has_pattern(loss, more) == (tokens(loss) == tokens(more))
+
+
+def test_published_losses_have_their_patterns():
+    trials = in_study([make_trial(candidate.loss, 1.0) for candidate in published()])
+    classes = analysis.table5_classes(analysis.trial_table(trials))
+    assert list(classes) == [*PATTERNS, *COUNTS]
+    for name in classes:
+        expected = [naive_class(candidate.loss, name) for candidate in published()]
+        assert [None if pd.isna(value) else bool(value) for value in classes[name]] == expected
+
+
+def test_table5_recovers_planted_effects_as_scipy_tests_them(planted):
+    table, candidates = planted
+    result = analysis.table5(table)
+    assert list(result.index) == [*PATTERNS, *COUNTS]
+    for name, row in result.iterrows():
+        groups = {
+            value: np.array([score for loss, score in candidates if naive_class(loss, name) is value])
+            for value in (True, False, None)
+        }
+        with_, without = groups[True], groups[False]
+        assert (row["n_with"], row["n_without"], row["n_neither"]) == tuple(map(len, groups.values()))
+        assert row["difference"] == pytest.approx(with_.mean() - without.mean(), abs=1e-9)
+        assert row["mean_with"] == pytest.approx(with_.mean(), abs=1e-9)
+        assert row["mean_without"] == pytest.approx(without.mean(), abs=1e-9)
+        summary = (with_.mean(), with_.std(ddof=1), len(with_), without.mean(), without.std(ddof=1), len(without))
+        for column, equal in (("welch_p", False), ("student_p", True)):
+            expected = scipy.stats.ttest_ind(with_, without, equal_var=equal).pvalue
+            assert row[column] == pytest.approx(expected, rel=1e-9, abs=1e-300)
+            # Another way to it: from the moments alone.
+            expected = scipy.stats.ttest_ind_from_stats(*summary, equal_var=equal).pvalue
+            assert row[column] == pytest.approx(expected, rel=1e-6, abs=1e-300)
+    for name, size in EFFECTS.items():
+        assert np.sign(result["difference"][name]) == np.sign(size) and result["welch_p"][name] < 1e-4
+
+
+def test_table5_is_exact_without_noise():
+    """Scores that one pattern decides alone: its difference is that effect."""
+    rng = np.random.default_rng(1)
+    drawn = [random_loss(rng, 2) for _ in range(300)]
+    trials = in_study([make_trial(loss, 70.0 + 12.5 * naive_class(loss, "Action inference")) for loss in drawn])
+    row = analysis.table5(analysis.trial_table(trials)).loc["Action inference"]
+    assert (row["difference"], row["mean_with"], row["mean_without"]) == (12.5, 82.5, 70.0)
+    assert row["welch_p"] == row["student_p"] == 0
+
+
+def test_population_says_what_is_left_out(planted):
+    table, _ = planted
+    counts = {"trials": 813, "analysed": 800, "pruned": 3, "fail": 4, "running": 3, "waiting": 1, "unusable": 2}
+    assert analysis.population(table).to_dict() == counts
+    assert set(analysis.analysed(table)["state"]) == {"complete"} and analysis.analysed(table)["score"].max() < 1e9
+
+
+def test_ties_may_count_as_without(planted):
+    table, candidates = planted
+    result = analysis.table5(table, ties_without=True)
+    for name in COUNTS:
+        with_ = [score for loss, score in candidates if naive_class(loss, name)]
+        without = [score for loss, score in candidates if not naive_class(loss, name)]
+        assert result["difference"][name] == pytest.approx(np.mean(with_) - np.mean(without))
+        assert result["n_without"][name] == len(without) and result["n_neither"][name] == 0
+    pd.testing.assert_frame_equal(result.loc[list(PATTERNS)], analysis.table5(table).loc[list(PATTERNS)])
+
+
+def test_patterns_in_notation_and_by_name(planted):
+    table, candidates = planted
+    patterns = {"two rewards": "{s_t} -> {r_t, r_t+1}", "named": "forward-dynamics", "value": AuxLoss.parse("{s_t} -> {s_t}")}
+    result = analysis.table5(table, patterns)
+    assert list(result.index) == [*patterns, *COUNTS]
+    n_with = sum({"s_t"} <= tokens(loss)[0] and {"r_t", "r_t+1"} <= tokens(loss)[1] for loss, _ in candidates)
+    assert result["n_with"]["two rewards"] == n_with > 0
+    with pytest.raises(ValueError, match="forward-dynamic"):
+        analysis.table5(table, {"typo": "forward-dynamcs"})
+    with pytest.raises(ValueError, match="expected a token"):
+        analysis.table5(table, {"typo": "{s_t} -> {q_t}"})
+
+
+def test_layout_of_table5(planted):
+    result = analysis.table5(planted[0])
+    result.loc["Inverse dynamics", ["difference", "welch_p", "student_p"]] = -3.514, 0.03, 0.2
+    result.loc["Action inference", ["difference", "welch_p", "student_p"]] = 42.438, 0.0099, 0.01
+    result.loc["State reconstruction", ["difference", "welch_p", "student_p"]] = np.nan
+    layout = analysis.table5_layout({"Cheetah-Run (Pixel)": result})
+    assert list(layout) == list(result.index) and list(layout.index) == ["Cheetah-Run (Pixel)"]
+    names = ["Inverse dynamics", "Action inference", "State reconstruction"]
+    assert layout.iloc[0][names].tolist() == ["-3.51*", "+42.44**", "–"]
+    layout = analysis.table5_layout({"Cheetah-Run (Pixel)": result}, "student_p")
+    assert layout.iloc[0][names].tolist() == ["-3.51", "+42.44*", "–"]
+
+
+@pytest.mark.filterwarnings("error")
+def test_small_studies_give_counts_and_no_p_values():
+    trials = in_study([make_trial(AuxLoss.parse("{s_t, a_t} -> {s_t+1}"), value) for value in (1.0, 3.0)])
+    row = analysis.table5(analysis.trial_table(trials)).loc["Forward dynamics"]
+    assert (row["n_with"], row["n_without"], row["mean_with"]) == (2, 0, 2.0)
+    assert row[["difference", "welch_p", "student_p", "mean_without"]].isna().all()
+    empty = analysis.trial_table([])
+    assert analysis.table5(empty)["n_with"].sum() == 0 and analysis.population(empty).sum() == 0
+    assert [len(of) for of in (analysis.effects(empty, "horizon"), analysis.diversity(empty), analysis.rankings(empty))] == [
+        0
+    ] * 3
+    assert analysis.winner_lineage([]).empty and analysis.rank_agreement(analysis.rankings(empty))["spearman"].isna().all()
+
+
+def test_effects_are_those_of_groups_against_the_rest():
+    rng = np.random.default_rng(2)
+    drawn = [random_loss(rng, 4, OPERATORS) for _ in range(200)]
+    scores = [rng.normal(10 * loss.negatives - 3 * loss.horizon, 5) for loss in drawn]
+    trials = [make_trial(loss, score, operators=OPERATORS) for loss, score in zip(drawn, scores, strict=True)]
+    table = analysis.trial_table(in_study([*trials, make_trial(drawn[0], state=TrialState.FAIL, operators=OPERATORS)]))
+    for by in ("horizon", ["operator", "negatives"]):
+        result = analysis.effects(table, by)
+        assert result["n"].sum() == 200
+        for key, row in result.iterrows():
+            member = [
+                loss.horizon == key if by == "horizon" else (loss.operator, loss.negatives) == tuple(key) for loss in drawn
+            ]
+            own, rest = np.array(scores)[member], np.array(scores)[~np.array(member)]
+            assert row["n"] == len(own)
+            statistics = (own.mean(), own.std(), np.median(own), own.mean() - rest.mean())
+            np.testing.assert_allclose(row[["mean", "std", "median", "difference"]].astype(float), statistics)
+            p_value = scipy.stats.ttest_ind(own, rest, equal_var=False).pvalue
+            np.testing.assert_allclose(row["welch_p"], p_value, rtol=1e-9)
+    # Studies side by side keep their trials apart even though the numbers repeat.
+    twice = analysis.effects(pd.concat([table.assign(task="a"), table.assign(task="b")]), "task")
+    assert twice["n"].tolist() == [200, 200] and twice["difference"].abs().max() < 1e-9
+    with pytest.raises(ValueError, match="'horizn'"):
+        analysis.effects(table, "horizn")
+
+
+@pytest.mark.parametrize(
+    "evaluator",
+    [FanovaImportanceEvaluator(seed=1), MeanDecreaseImpurityImportanceEvaluator(seed=1), PedAnovaImportanceEvaluator()],
+    ids=["fanova", "impurity", "ped-anova"],
+)
+def test_importances_find_what_was_planted(evaluator):
+    """Also for a token that short losses do not have, and the same whatever Optuna's evaluator."""
+    rng = np.random.default_rng(3)
+    drawn = [random_loss(rng, 3, ("mse", "bilinear")) for _ in range(200)]
+
+    def score(loss):
+        late = len(loss.source) > 6 and loss.source[6]
+        return 30 * late - 12 * loss.target[0] + rng.normal(0, 2)
+
+    values = [score(loss) for loss in drawn]
+    trials = [make_trial(loss, value, operators=("mse", "bilinear")) for loss, value in zip(drawn, values, strict=True)]
+    pruned = make_trial(drawn[0], 1e9, state=TrialState.PRUNED, operators=("mse", "bilinear"))
+    result = analysis.importances(analysis.trial_table(in_study([*trials, pruned])), evaluator)
+    names = {f"{side}/{kind}_t{f'+{i}' if i else ''}" for side in ("source", "target") for kind in "sar" for i in range(3)}
+    assert set(result.index) == names | {"source/s_t+3", "target/s_t+3", "horizon", "operator", "negatives"}
+    assert result["importance"].sum() == pytest.approx(1) and result["importance"].is_monotonic_decreasing
+    # Optuna knows the horizon to be bound up with the late token.
+    assert list(result.index.drop("horizon"))[0] == "source/s_t+2"
+    chosen = np.array([loss.horizon > 1 and loss.source[6] for loss in drawn])
+    row = result.loc["source/s_t+2"]
+    assert (row["n_with"], row["n_without"]) == (chosen.sum(), (~chosen).sum())
+    assert row["difference"] == pytest.approx(np.mean(np.array(values)[chosen]) - np.mean(np.array(values)[~chosen]))
+    assert result.loc["horizon", ["difference", "n_with"]].isna().all()
+
+
+def test_importances_are_repeatable_and_need_scores_that_differ():
+    rng = np.random.default_rng(4)
+    drawn = [random_loss(rng, 1) for _ in range(40)]
+    table = analysis.trial_table(in_study([make_trial(loss, float(loss.target[3])) for loss in drawn]))
+    first, second = analysis.importances(table), analysis.importances(table)
+    pd.testing.assert_frame_equal(first, second)
+    assert first.index[0] == "target/s_t+1" and not {"operator", "negatives"} & set(first.index)
+    with pytest.raises(ValueError, match="40 complete trials"):
+        analysis.importances(table.assign(score=1.0))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(losses(), min_size=1, max_size=12))
+def test_diversity_against_all_pairs(drawn):
+    trials = [make_trial(loss, 1.0, operators=OPERATORS, stage=3) for loss in drawn]
+    trials.append(make_trial(drawn[0], state=TrialState.FAIL, operators=OPERATORS, stage=3))
+    result = analysis.diversity(analysis.trial_table(in_study(trials)))
+    assert list(result.index) == [3]
+    canonical = [loss.canonical() for loss in drawn]
+    masks = [[*((*mask, *([False] * 10))[:10] for mask in (loss.source, loss.target))] for loss in canonical]
+    expected = pdist(np.array(masks).reshape(len(drawn), 20), "hamming").mean() * 20 if len(drawn) > 1 else np.nan
+    row = result.loc[3]
+    assert row["n"] == len(drawn) and row["distinct"] == pytest.approx(len(set(canonical)) / len(drawn))
+    np.testing.assert_allclose(row["hamming"], expected)
+
+
+def test_an_evolution_of_the_sampler():
+    """Columns out of a real search; it narrows down, and its winner's line goes back to the first stage."""
+    sampler = AuxLossSampler(population_size=20, n_random=16, n_prior=4, max_horizon=3, seed=0, n_stages=5)
+    study = optuna.create_study(direction="maximize", sampler=sampler)
+    study.optimize(lambda trial: float(sum(suggest_aux_loss(trial, 3).target)), n_trials=100)
+    trials = study.get_trials(deepcopy=False)
+    table = analysis.trial_table(trials)
+    assert table["score"].tolist() == [sum(loss.target) for loss in table["loss"]]
+    assert table["stage"].value_counts().to_dict() == dict.fromkeys(range(1, 6), 20)
+    assert set(table["operation"]) == {"random", "prior", "replacement", "crossover", "horizon_change"}
+    spread = analysis.diversity(table)
+    assert spread["n"].tolist() == [20] * 5 and spread["hamming"][5] < spread["hamming"][1]
+
+    line = analysis.winner_lineage(trials)
+    assert line["score"].iloc[0] == table["score"].max() and line["number"].is_monotonic_decreasing
+    assert line["stage"].min() == 1 and not line["parents"].iloc[-1]
+    found, todo = set(), [int(line["number"].iloc[0])]
+    while todo:
+        found.add(todo.pop())
+        todo += [parent for number in found for parent in table["parents"][number] if parent not in found]
+    assert set(line["number"]) == found
+    for row in line.itertuples():
+        expected = row.score - max(table["score"][row.parents]) if row.parents else np.nan
+        np.testing.assert_equal(row.gain, expected)
+    worst = analysis.winner_lineage(trials, StudyDirection.MINIMIZE)
+    assert worst["score"].iloc[0] == table["score"].min()
+
+
+def test_rankings_under_three_metrics():
+    rng = np.random.default_rng(5)
+    loss = AuxLoss.parse("{s_t} -> {s_t+1}")
+    curves = np.round(rng.normal(100, 10, (40, 5)), 1) + np.arange(5) * 30
+    trials = [
+        make_trial(loss, float(curve.mean()), curve=[[1000 * (i + 1), mean, 1.0] for i, mean in enumerate(curve.tolist())])
+        for curve in curves
+    ]
+    others = [
+        make_trial(loss, 9.0),  # no curve
+        make_trial(loss, 1e6, state=TrialState.PRUNED, curve=[[1000, 1e6, 0.0]]),
+        make_trial(loss, state=TrialState.FAIL),
+    ]
+    ranking = analysis.rankings(analysis.trial_table(in_study([*trials, *others])))
+    metrics = {"aulc": curves.mean(axis=1), "first": curves[:, 0], "last": curves[:, -1]}
+    by_number = ranking.sort_values("number")
+    assert by_number["number"].tolist() == list(range(40)) and ranking["rank_aulc"].is_monotonic_increasing
+    for name, values in metrics.items():
+        np.testing.assert_allclose(by_number[name], values)
+        assert by_number[f"rank_{name}"].tolist() == [1 + int((values > value).sum()) for value in values]
+    agreement = analysis.rank_agreement(ranking, top=7)
+    assert list(agreement.index) == list(combinations(metrics, 2))
+    for (one, other), row in agreement.iterrows():
+        for test, name in ((scipy.stats.spearmanr, "spearman"), (scipy.stats.kendalltau, "kendall")):
+            np.testing.assert_allclose([row[name], row[f"{name}_p"]], test(metrics[one], metrics[other]))
+        tops = [set(np.argsort(-metrics[name], kind="stable")[:7]) for name in (one, other)]
+        assert row["shared"] == len(tops[0] & tops[1])
+
+
+def test_curves_with_other_checkpoints_are_named():
+    loss = AuxLoss.parse("{s_t} -> {s_t+1}")
+    trials = in_study([make_trial(loss, 1.0, curve=[[steps, 1.0, 0.0]]) for steps in (1000, 1000, 2000)])
+    with pytest.raises(ValueError, match="trial 2 was evaluated at 2000 environment steps, trial 0 at 1000"):
+        analysis.rankings(analysis.trial_table(trials))
