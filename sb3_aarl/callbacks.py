@@ -4,7 +4,7 @@ import csv
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -42,14 +42,48 @@ def aulc(curve: Sequence[Evaluation]) -> float:
     return float(np.mean([evaluation.mean for evaluation in curve]))
 
 
+class SingleEpisodes(gym.Wrapper):
+    """
+    One episode for each ``reset(seed=...)``, and nothing is simulated after it.
+
+    SB3's vectorized environments reset an environment as soon as its episode ends, and step it until all others have ended
+    theirs. Here that costs nothing: until the next seed, the environment stays at its last observation.
+
+    :param env: The environment, ``Monitor`` included
+    """
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self._over = False
+        self._observation: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        if self._over and seed is None:
+            return self._observation, {}
+        self._over = False
+        self._observation, info = self.env.reset(seed=seed, options=options)
+        return self._observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        if self._over:
+            return self._observation, 0.0, False, False, {}
+        self._observation, reward, terminated, truncated, info = self.env.step(action)
+        self._over = terminated or truncated
+        return self._observation, reward, terminated, truncated, info
+
+
 class LearningCurveCallback(BaseCallback):
     """
     Evaluate with deterministic actions at fixed environment steps (paper, A.2: 10 episodes).
 
-    Evaluation k starts from initial states that only ``seed`` and k decide, so that runs can be compared and a resumed
-    run draws the same ones. The last checkpoint may be the end of training.
+    Episode i of evaluation k is that of ``reset(seed=seed + 1000 * k + i)``, so that runs can be compared and a resumed run
+    draws the same initial states. As many episodes run at once as there are evaluation environments, with one prediction
+    for all. How many changes the last bits of actions, as matrix products of other sizes round differently, and simulations
+    with contacts make much of little: compare runs that are evaluated with equally many. The last checkpoint may be the end
+    of training.
 
-    :param eval_env: Environment to evaluate on, not the one that is trained on
+    :param eval_env: Environment to evaluate on, not the one that is trained on. A VecEnv, such as
+        ``make_vec_env(make_dmc_env, 10, wrapper_class=SingleEpisodes, env_kwargs=...)``, has at most ``n_eval_episodes``
     :param checkpoints: Environment steps (agent steps x action repeat) at which to evaluate, ascending
     :param n_eval_episodes: Episodes of each evaluation
     :param action_repeat: Environment steps of one agent step, None to ask the environment's wrappers
@@ -58,7 +92,7 @@ class LearningCurveCallback(BaseCallback):
     :param on_evaluation: Called after each evaluation; training stops if it returns False
     :param curve: Evaluations that were made before, of a run that goes on
     :param verbose: 1 prints each evaluation
-    :raises ValueError: when the checkpoints are not ascending, or lie between two agent steps
+    :raises ValueError: when the checkpoints are not ascending, or lie between two agent steps, or a VecEnv is too large
     """
 
     def __init__(
@@ -75,7 +109,7 @@ class LearningCurveCallback(BaseCallback):
     ):
         super().__init__(verbose)
         if not isinstance(eval_env, VecEnv):
-            env = eval_env if is_wrapped(eval_env, Monitor) else Monitor(eval_env)
+            env = SingleEpisodes(eval_env if is_wrapped(eval_env, Monitor) else Monitor(eval_env))
             eval_env = DummyVecEnv([lambda: env])
         self.eval_env = eval_env
         if action_repeat is None:
@@ -89,6 +123,8 @@ class LearningCurveCallback(BaseCallback):
                 raise ValueError(f"checkpoint {checkpoint} is no multiple of the action repeat {action_repeat}")
         if n_eval_episodes < 1:
             raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
+        if eval_env.num_envs > n_eval_episodes:
+            raise ValueError(f"eval_env has {eval_env.num_envs} environments, more than n_eval_episodes={n_eval_episodes}")
         self.n_eval_episodes = n_eval_episodes
         self.seed = seed
         self.path = None if path is None else Path(path)
@@ -113,10 +149,7 @@ class LearningCurveCallback(BaseCallback):
     def _evaluate(self) -> bool:
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
-        # Far apart, as environment i of a VecEnv takes seed + i.
-        self.eval_env.seed(self.seed + 1000 * len(self.curve))
-        returns, _ = evaluate_policy(self.model, self.eval_env, self.n_eval_episodes, return_episode_rewards=True)
-        assert isinstance(returns, list)
+        returns = self._episode_returns(self.seed + 1000 * len(self.curve))
         evaluation = Evaluation(
             environment_steps=self.checkpoints[len(self.curve)],
             mean=float(np.mean(returns)),
@@ -132,6 +165,18 @@ class LearningCurveCallback(BaseCallback):
         if self.verbose:
             print(f"{evaluation.environment_steps:>9,} environment steps: {evaluation.mean:7.1f} +- {evaluation.std:.1f}")
         return self.on_evaluation is None or self.on_evaluation(evaluation) is not False
+
+    def _episode_returns(self, seed: int) -> list[float]:
+        """Returns of the episodes with this seed and the following ones; those that ran at once as they ended."""
+        returns: list[float] = []
+        while len(returns) < self.n_eval_episodes:
+            n = min(self.eval_env.num_envs, self.n_eval_episodes - len(returns))
+            # Environment i takes seed + i; of more environments than episodes, evaluate_policy plays with the last ones.
+            self.eval_env.seed(seed + len(returns) - (self.eval_env.num_envs - n))
+            some, _ = evaluate_policy(self.model, self.eval_env, n, return_episode_rewards=True)
+            assert isinstance(some, list)
+            returns += some
+        return returns
 
     @property
     def aulc(self) -> float:

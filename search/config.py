@@ -15,6 +15,7 @@ from typing import Any, Union, get_args, get_origin
 
 import gymnasium as gym
 import yaml
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_aarl import SACAux, catalog
@@ -25,6 +26,8 @@ from sb3_aarl.policies import SACAuxPolicy
 # Values in a file, aliases written out.
 LARGEST = 100_000
 PRUNERS = ("none", "median", "hyperband")
+# How several environments run, under the names of RL-Zoo's option --vec-env.
+VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
 # What AuxLossSampler takes, under the same names.
 SAMPLER_KEYS = (
     *("population_size", "n_random", "n_prior", "parents", "replacement", "crossover", "horizon_change", "random"),
@@ -188,8 +191,13 @@ def load_config(path: str | Path) -> SearchConfig:
 def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     """
     Read the hyper-parameters of an environment from a file like RL-Zoo's: a mapping from environment id to arguments of
-    SACAux, ``policy``, ``n_timesteps`` (agent steps) and ``env_kwargs`` (of ``make_dmc_env``, or of ``wrap_env`` for
-    what is not DeepMind Control). The environment's own entry is merged over the entry ``default``.
+    SACAux, ``policy``, ``n_timesteps`` (agent steps), ``n_envs`` (environments that are trained on at once) and
+    ``env_kwargs`` (of ``make_dmc_env``, or of ``wrap_env`` for what is not DeepMind Control). The environment's own entry
+    is merged over the entry ``default``.
+
+    As in RL-Zoo, ``n_envs`` alone makes fewer updates; ``gradient_steps: -1`` keeps one for each transition. ``vec_env`` is
+    ``dummy`` (all in one process) or ``subproc`` (each in its own, faster where there are cores for them, and equal
+    otherwise); RL-Zoo has it on the command line.
 
     Values are plain: nothing in the file is evaluated, schedules as text are refused.
 
@@ -208,6 +216,16 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
             raise ConfigError(f"{path}: {entry} must be a mapping, not {reprlib.repr(own)}")
         merged = merge(merged, own)
     return _checked_hyperparameters(merged, env_id, str(path))
+
+
+def named_environments(path: str | Path) -> list[str]:
+    """
+    The environments that have an entry of their own in a file of hyper-parameters.
+
+    :param path: The YAML file
+    :raises ConfigError: naming the file, when it cannot be read
+    """
+    return [key for key in _read(Path(path)) if key != "default"]
 
 
 def load_aux_loss(path: str | Path) -> AuxLoss:
@@ -402,6 +420,8 @@ _ARGUMENTS = {
     **_arguments(SACAux, without=("env", "seed", "action_noise", "replay_buffer_class", "_init_setup_model")),
     "policy": str,
     "n_timesteps": int,
+    "n_envs": int,
+    "vec_env": str,
     "env_kwargs": dict,
 }
 
@@ -418,6 +438,10 @@ def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str)
     if checked.get("aux_loss") not in (None, "auto"):
         _convert(values["aux_loss"], AuxLoss, f"{where}: aux_loss", Path())
         checked["aux_loss"] = None if values["aux_loss"] == "none" else values["aux_loss"]
+    if checked.get("n_envs", 1) < 1:
+        raise ConfigError(f"{where}: n_envs must be at least 1, not {checked['n_envs']}")
+    if checked.get("vec_env", "dummy") not in VEC_ENVS:
+        raise ConfigError(f"{where}: vec_env must be one of {', '.join(VEC_ENVS)}, not {checked['vec_env']!r}")
     return checked
 
 

@@ -1,22 +1,27 @@
 """Train one candidate: environment, model, learning curve, and checkpoints from which a killed training goes on."""
 
+import contextlib
+import functools
 import hashlib
 import json
 import logging
+import math
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
-from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, aulc, read_curve, write_curve
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
 from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
-from search.config import load_aux_loss, load_hyperparameters, resolve_env_id
+from search.config import VEC_ENVS, load_aux_loss, load_hyperparameters, resolve_env_id
 
 logger = logging.getLogger(__name__)
 
@@ -40,16 +45,15 @@ class TrainingRun(NamedTuple):
     aulc: float
 
 
-def make_env(env_id: str, env_kwargs: Mapping[str, Any], seed: int | None = None) -> gym.Env:
+def make_env(env_id: str, env_kwargs: Mapping[str, Any]) -> gym.Env:
     """
     An environment of a configuration.
 
     :param env_id: Id of a DeepMind Control task, or of any other Gymnasium environment
     :param env_kwargs: Arguments of ``make_dmc_env``, or of ``wrap_env``
-    :param seed: Seed of ``make_dmc_env``; other environments take the one of ``reset``
     """
     if env_id.startswith(PREFIX):
-        return make_dmc_env(env_id, **env_kwargs, seed=seed)
+        return make_dmc_env(env_id, **env_kwargs)
     return wrap_env(gym.make(env_id, render_mode="rgb_array" if env_kwargs.get("pixels") else None), **env_kwargs)
 
 
@@ -93,6 +97,9 @@ def train_candidate(
     for whatever reason but an interruption, the checkpoint is removed and ``curve.csv`` stays; a training whose curve
     is complete is not repeated.
 
+    With ``n_envs`` environments in the hyper-parameters, all of their steps count, and a checkpoint that lies between two
+    steps of them is evaluated after the second. ``gradient_steps: -1`` keeps one update for each transition.
+
     :param environment: Id of the environment
     :param aux_loss: The auxiliary loss as SACAux takes it
     :param hyperparameters: As ``load_hyperparameters`` gives them
@@ -111,46 +118,52 @@ def train_candidate(
     settings = dict(hyperparameters)
     settings.pop("n_timesteps", None)
     env_kwargs = settings.pop("env_kwargs", None) or {}
-    policy = settings.pop("policy", "CnnPolicy" if env_kwargs.get("pixels") else "MlpPolicy")
+    n_envs, vec_env_cls = settings.pop("n_envs", 1), VEC_ENVS[settings.pop("vec_env", "dummy")]
+    pixels = env_kwargs.get("pixels", False)
+    policy = settings.pop("policy", "CnnPolicy" if pixels else "MlpPolicy")
     agent_steps = checkpoints[-1] // env_kwargs.get("action_repeat", 1)
     if "buffer_size" in settings:
-        settings["buffer_size"] = min(settings["buffer_size"], agent_steps)  # the same run, with smaller checkpoints
+        # The same run, with smaller checkpoints; the buffer has as many places for each environment.
+        settings["buffer_size"] = min(settings["buffer_size"], math.ceil(agent_steps / n_envs) * n_envs)
     settings |= {"aux_loss": aux_loss, "seed": seed}
 
     store, curve = None, None
     if folder is not None:
-        asked_for = [environment, policy, env_kwargs, settings, list(checkpoints), evaluation_episodes]
+        asked_for = [environment, policy, env_kwargs, n_envs, settings, list(checkpoints), evaluation_episodes]
         store = _RunFolder(Path(folder), str(aux_loss), seed, asked_for)
         curve = store.finished_curve(checkpoints, keep_model)
     if curve is None:
-        env = make_env(environment, env_kwargs, seed)
-        eval_env = make_env(environment, env_kwargs)
-        try:
-            model, curve = store.load(env, settings.get("device", "auto")) if store is not None else (None, [])
-            if _repeat(curve, on_evaluation):
-                model = model or SACAux(policy, env, **settings)
-                curve_callback = LearningCurveCallback(
-                    eval_env,
-                    checkpoints,
-                    evaluation_episodes,
-                    seed=EVALUATION_SEED + seed,
-                    path=None if store is None else store.curve_path,
-                    on_evaluation=on_evaluation,
-                    curve=curve,
-                )
-                curve = curve_callback.curve
-                saving = [] if store is None else [_CheckpointCallback(store, curve)]
-                _learn(model, agent_steps, [curve_callback, *saving], progress_bar)
-                if store is not None and keep_model:
-                    store.save_model(model)
-        except Exception:
-            # Not after an interruption, which is no Exception.
-            if store is not None:
-                store.remove_checkpoint()
-            raise
-        finally:
-            env.close()
-            eval_env.close()
+        make = functools.partial(make_vec_env, make_env, env_kwargs={"env_id": environment, "env_kwargs": env_kwargs})
+        # From states a prediction takes as long as a step of an environment: one for all episodes. A picture takes much
+        # longer than the prediction from it, and each environment that renders has tens of megabytes for it.
+        n_eval, eval_cls = (min(n_envs, evaluation_episodes), vec_env_cls) if pixels else (evaluation_episodes, DummyVecEnv)
+        with (
+            _closed(make(n_envs, seed=seed, vec_env_cls=vec_env_cls)) as env,
+            _closed(make(n_eval, seed=0, vec_env_cls=eval_cls, wrapper_class=SingleEpisodes)) as eval_env,
+        ):
+            try:
+                model, curve = store.load(env, settings.get("device", "auto")) if store is not None else (None, [])
+                if _repeat(curve, on_evaluation):
+                    model = model or SACAux(policy, env, **settings)
+                    curve_callback = LearningCurveCallback(
+                        eval_env,
+                        checkpoints,
+                        evaluation_episodes,
+                        seed=EVALUATION_SEED + seed,
+                        path=None if store is None else store.curve_path,
+                        on_evaluation=on_evaluation,
+                        curve=curve,
+                    )
+                    curve = curve_callback.curve
+                    saving = [] if store is None else [_CheckpointCallback(store, curve)]
+                    _learn(model, agent_steps, [curve_callback, *saving], progress_bar)
+                    if store is not None and keep_model:
+                        store.save_model(model)
+            except Exception:
+                # Not after an interruption, which is no Exception.
+                if store is not None:
+                    store.remove_checkpoint()
+                raise
     else:
         _repeat(curve, on_evaluation)
     if store is not None:
@@ -215,6 +228,16 @@ def train_and_keep(
     return run, Path(folder)
 
 
+@contextlib.contextmanager
+def _closed(env: VecEnv) -> Iterator[VecEnv]:
+    """Close environments in the end. Their processes may be gone before: they failed, or Ctrl-C has reached them too."""
+    try:
+        yield env
+    finally:
+        with contextlib.suppress(EOFError, OSError):
+            env.close()
+
+
 def _repeat(curve: Sequence[Evaluation], on_evaluation: Callable[[Evaluation], bool | None] | None) -> bool:
     """Tell of the evaluations of a run that goes on; False if training is to end."""
     return on_evaluation is None or all(on_evaluation(evaluation) is not False for evaluation in curve)
@@ -258,7 +281,7 @@ class _RunFolder:
             return None
         return curve if [evaluation.environment_steps for evaluation in curve] == list(checkpoints) else None
 
-    def load(self, env: gym.Env, device: str) -> tuple[SACAux | None, list[Evaluation]]:
+    def load(self, env: VecEnv, device: str) -> tuple[SACAux | None, list[Evaluation]]:
         """The last checkpoint: model with replay buffer, and its curve; without one, the folder begins anew."""
         saved = [path for path in self._checkpoints.glob("*") if path.name.isdecimal()]
         if saved:

@@ -11,31 +11,34 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_aarl import SACAux
-from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, aulc, read_curve, write_curve
-from sb3_aarl.envs import RepeatAction
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
+from sb3_aarl.envs import RepeatAction, make_dmc_env
 
 
 class Walk(gym.Env):
-    """A random walk of 7 steps; the reward is where it is. Remembers with which seeds it was reset."""
+    """A random walk of 5 to 9 steps; the reward is where it is. Remembers where its episodes began, and counts steps."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = spaces.Box(-1, 1, (1,), np.float32)
 
     def __init__(self) -> None:
         self.starts: list[np.ndarray] = []
+        self.steps = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
-        self.left = 7
         self.point = self.np_random.normal(size=2).astype(np.float32)
+        self.left = int(self.np_random.integers(5, 10))
         self.starts.append(self.point)
         return self.point, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         self.left -= 1
+        self.steps += 1
         self.point = (self.point + 0.1 * action + 0.1 * self.np_random.normal(size=2)).astype(np.float32)
         return self.point, float(self.point[0]), False, self.left == 0, {}
 
@@ -77,27 +80,63 @@ def test_evaluates_at_the_checkpoints(n_envs: int, action_repeat: int, checkpoin
     assert all(evaluation.episodes == 2 for evaluation in told)
 
 
-def test_the_returns_are_those_of_deterministic_episodes_from_seeded_states() -> None:
+def play(model: SACAux, env: gym.Env, seed: int) -> tuple[float, int]:
+    """Return and length of the deterministic episode with a seed."""
+    observation, _ = env.reset(seed=seed)
+    total, steps, over = 0.0, 0, False
+    while not over:
+        action, _ = model.predict(observation, deterministic=True)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        total, steps, over = total + float(reward), steps + 1, terminated or truncated
+    return total, steps
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 3, 5])
+@pytest.mark.parametrize("wrapper", [SingleEpisodes, None], ids=["single", "plain"])
+def test_the_returns_are_those_of_seeded_episodes_however_many_run_at_once(wrapper: Any, at_once: int) -> None:
     model = make_model(Walk())
-    expected: list[tuple[float, float]] = []
+    expected: list[list[tuple[float, int]]] = []
 
-    def play(_: Evaluation) -> None:
-        env = Walk()
-        returns = []
-        for episode in range(3):
-            # Only the first reset is seeded, as in a VecEnv.
-            observation, _ = env.reset(seed=40 + 1000 * len(expected) if episode == 0 else None)
-            total, over = 0.0, False
-            while not over:
-                action, _ = model.predict(observation, deterministic=True)
-                observation, reward, _, over, _ = env.step(action)
-                total += reward
-            returns.append(total)
-        expected.append((np.mean(returns), np.std(returns)))
+    def play_again(_: Evaluation) -> None:
+        expected.append([play(model, Walk(), 40 + 1000 * len(expected) + episode) for episode in range(5)])
 
-    callback = LearningCurveCallback(Walk(), [10, 30], 3, seed=40, on_evaluation=play)
+    eval_env = make_vec_env(Walk, at_once, wrapper_class=wrapper)
+    callback = LearningCurveCallback(eval_env, [10, 30], 5, seed=40, on_evaluation=play_again)
     model.learn(30, callback)
-    np.testing.assert_allclose([(point.mean, point.std) for point in callback.curve], expected, rtol=1e-5, atol=1e-5)
+    returns = [[total for total, _ in evaluation] for evaluation in expected]
+    # Matrix products of more rows round differently.
+    np.testing.assert_allclose([point.mean for point in callback.curve], np.mean(returns, 1), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose([point.std for point in callback.curve], np.std(returns, 1), rtol=1e-4, atol=1e-4)
+    if wrapper is SingleEpisodes and 5 % at_once == 0:
+        assert isinstance(eval_env, DummyVecEnv)
+        walks = [env.unwrapped for env in eval_env.envs]
+        assert sum(len(walk.starts) for walk in walks) == 10  # not one more
+        assert sum(walk.steps for walk in walks) == sum(steps for evaluation in expected for _, steps in evaluation)
+
+
+def test_on_dm_control_several_at_once_give_the_same_returns_bit_for_bit() -> None:
+    """Apart from the rounding of matrix products, which is kept out here: each observation is predicted from alone."""
+    kwargs = {"env_id": "cheetah-run", "action_repeat": 50}
+    model = make_model(make_dmc_env(**kwargs))
+    predict = model.predict
+
+    def one_by_one(observations: np.ndarray, **settings: Any) -> tuple[np.ndarray, None]:
+        return np.stack([predict(observation, deterministic=True)[0] for observation in observations]), None
+
+    def returns(eval_env: gym.Env | VecEnv) -> list[float]:
+        callback = LearningCurveCallback(eval_env, [50], 10, seed=3)
+        callback.init_callback(model)
+        return callback._episode_returns(3)
+
+    env = make_dmc_env(**kwargs)
+    alone = [play(model, env, 3 + episode)[0] for episode in range(2)]
+    model.predict = one_by_one  # type: ignore[method-assign]
+    one = returns(make_dmc_env(**kwargs))
+    np.testing.assert_allclose(one[:2], alone, atol=1e-6)  # Monitor rounds to six digits
+    assert len(set(one)) == 10
+    for at_once in (3, 10):
+        eval_env = make_vec_env(make_dmc_env, at_once, env_kwargs=kwargs, wrapper_class=SingleEpisodes)
+        assert sorted(returns(eval_env)) == sorted(one)
 
 
 def parameters_after(checkpoints: list[int] | None, episodes: int = 3) -> list[th.Tensor]:
@@ -125,9 +164,8 @@ def test_a_resumed_curve_goes_on_with_the_same_initial_states() -> None:
     assert resumed.curve[:2] == whole.curve[:2]
     assert [point.environment_steps for point in resumed.curve] == [10, 20, 30]
     assert resumed.curve[2].seconds >= whole.curve[1].seconds
-    # A VecEnv resets once more behind the last episode of an evaluation.
-    np.testing.assert_array_equal(resumed_env.starts[:2], whole_env.starts[6:8])
-    assert len(whole_env.starts) == 9
+    assert len(whole_env.starts) == 6
+    np.testing.assert_array_equal(resumed_env.starts, whole_env.starts[4:])
 
 
 def test_training_ends_when_the_function_says_false() -> None:
@@ -161,6 +199,11 @@ def test_normalized_environments_share_their_statistics() -> None:
 def test_what_does_not_fit_is_refused(checkpoints: list[int], kwargs: dict[str, int], culprit: str) -> None:
     with pytest.raises(ValueError, match=culprit):
         LearningCurveCallback(Walk(), checkpoints, **kwargs)
+
+
+def test_more_environments_than_episodes_are_refused() -> None:
+    with pytest.raises(ValueError, match="eval_env has 3 environments"):
+        LearningCurveCallback(make_vec_env(Walk, 3), [5], n_eval_episodes=2)
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)

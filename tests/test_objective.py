@@ -19,9 +19,11 @@ from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import RandomSampler
 from optuna.storages import RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, TrialState
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_aarl import AuxLoss, SACAux
-from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, aulc, read_curve
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve
 from sb3_aarl.envs import make_dmc_env
 from search import training
 from search.config import load_config
@@ -77,6 +79,30 @@ for failure in ("raise", "memory", "interrupt", "diverge"):
     gym.register(f"Broken-{failure}-v0", Broken, kwargs={"failure": failure}, disable_env_checker=True)
 
 
+class Counting(gym.Env):
+    """Episodes of 10 steps; counts the steps of all its environments."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    steps = 0
+
+    def __init__(self, render_mode: str | None = None):
+        pass
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.left = 10
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        Counting.steps += 1
+        self.left -= 1
+        return np.zeros(2, np.float32), 0.0, False, self.left == 0, {}
+
+
+gym.register("Counting-v0", Counting, disable_env_checker=True)
+
+
 def make_objective(folder: Path, **settings: Any) -> Objective:
     (folder / "hyper.yml").write_text(yaml.safe_dump({"default": HYPER}))
     values = {
@@ -106,7 +132,9 @@ def test_the_curve_is_that_of_a_plain_training(tmp_path: Path) -> None:
     run = train_candidate(ENV, LOSS, HYPER, 3, CHECKPOINTS, 2, tmp_path / "run", told.append)
     settings = {key: value for key, value in HYPER.items() if key != "env_kwargs"}
     model = SACAux("MlpPolicy", make_dmc_env(ENV, action_repeat=40, seed=3), aux_loss=LOSS, seed=3, **settings)
-    curve = LearningCurveCallback(make_dmc_env(ENV, action_repeat=40), CHECKPOINTS, 2, seed=10_003)
+    env_kwargs = {"env_id": ENV, "action_repeat": 40}
+    eval_env = make_vec_env(make_dmc_env, 2, seed=0, wrapper_class=SingleEpisodes, env_kwargs=env_kwargs)
+    curve = LearningCurveCallback(eval_env, CHECKPOINTS, 2, seed=10_003)
     model.learn(60, curve)
     assert [point[:4] for point in run.curve] == [point[:4] for point in curve.curve]
     assert run.aulc == pytest.approx(np.mean([point.mean for point in curve.curve]))
@@ -160,6 +188,89 @@ def test_checkpoints_are_spread(steps: int, n: int, repeat: int, expected: tuple
 def test_too_few_steps_are_refused() -> None:
     with pytest.raises(ValueError, match="too few"):
         spread_checkpoints(30, 4, 8)
+
+
+# Several environments.
+
+
+@pytest.fixture
+def learned(monkeypatch: pytest.MonkeyPatch) -> list[SACAux]:
+    """The models that have learned."""
+    models: list[SACAux] = []
+    learn = SACAux.learn
+
+    def watched(self: SACAux, *args: Any, **kwargs: Any) -> SACAux:
+        models.append(learn(self, *args, **kwargs))
+        return self
+
+    monkeypatch.setattr(SACAux, "learn", watched)
+    return models
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "evaluated_after", "updates"),
+    # Environment steps of all environments; updates for all transitions after the random ones but the last step's, as
+    # many as the last step has: 20 agent steps, of which 10 are random.
+    [(1, [20, 40], 10), (2, [20, 40], 10), (4, [24, 40], 12)],
+)
+def test_the_steps_of_all_environments_count(
+    n_envs: int, evaluated_after: list[int], updates: int, learned: list[SACAux]
+) -> None:
+    hyper = HYPER | {"env_kwargs": {"action_repeat": 2}, "n_envs": n_envs, "gradient_steps": -1, "train_freq": 1}
+    after: list[int] = []
+    began = Counting.steps
+
+    def on_evaluation(evaluation: Evaluation) -> None:
+        # 3 episodes of 10 steps in each evaluation, and not a step more.
+        after.append(Counting.steps - began - 30 * (len(after) + 1))
+
+    run = train_candidate("Counting-v0", LOSS, hyper, 0, [20, 40], 3, on_evaluation=on_evaluation)
+    assert [point.environment_steps for point in run.curve] == [20, 40]
+    assert after == evaluated_after
+    (model,) = learned
+    assert model.num_timesteps == 20 and model._n_updates == updates
+    assert model.replay_buffer.size() * n_envs == 20
+
+
+def test_environments_in_processes_of_their_own_are_the_same_run(learned: list[SACAux]) -> None:
+    hyper = HYPER | {
+        "env_kwargs": {"action_repeat": 40, "pixels": True, "image_size": 16, "frame_stack": 2},
+        "policy_kwargs": {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8, "n_filters": 4}},
+        "augmentation": "none",
+        "gradient_steps": -1,
+        "n_envs": 2,
+    }
+    dummy, subproc = (train_candidate(ENV, LOSS, hyper | {"vec_env": kind}, 1, [800], 1) for kind in ("dummy", "subproc"))
+    assert dummy.curve[0][:4] == subproc.curve[0][:4]
+    one, other = learned
+    assert one._n_updates == other._n_updates == 10
+    assert all(value.equal(other.policy.state_dict()[key]) for key, value in one.policy.state_dict().items())
+    assert one.replay_buffer_kwargs == other.replay_buffer_kwargs == {"frame_stack": 2}
+
+
+def test_an_interruption_stays_one_where_the_processes_of_environments_are_gone() -> None:
+    env = make_vec_env("Pendulum-v1", 1, vec_env_cls=SubprocVecEnv)
+    with pytest.raises(KeyboardInterrupt), training._closed(env):
+        env.processes[0].kill()
+        env.processes[0].join()
+        raise KeyboardInterrupt
+
+
+def test_several_environments_go_on_after_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hyper = HYPER | {"n_envs": 2, "gradient_steps": -1}
+
+    def stop(evaluation: Evaluation) -> None:
+        if evaluation.environment_steps == CHECKPOINTS[1]:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_candidate(ENV, LOSS, hyper, 0, CHECKPOINTS, 1, tmp_path, stop)
+    before = read_curve(tmp_path / "checkpoint" / "800" / "curve.csv")
+    begins = trained_steps(monkeypatch)
+    run = train_candidate(ENV, LOSS, hyper, 0, CHECKPOINTS, 1, tmp_path)
+    assert begins == [(20, 10, 10)]
+    assert run.curve[:1] == before
+    assert [point.environment_steps for point in run.curve] == list(CHECKPOINTS)
 
 
 # Checkpoints.
