@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from search.evolve import Progress
-    from search.grid import Cell, Grid
+    from search.grid import Cell, Runs
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__.partition("\n")[0])
 console = Console()
@@ -184,7 +184,7 @@ def _stages_line(progress: "Progress") -> str:
 
 
 def _train_grid(
-    grid: "Grid", folder: Path, storage: str | None, workers: int, threads: int | None
+    grid: "Runs", folder: Path, storage: str | None, workers: int, threads: int | None
 ) -> "tuple[pd.DataFrame, dict[Cell, str]]":
     """Train the runs of a grid that are missing, with a progress bar; scores of all, and what had to be given up."""
     from search import grid as grids
@@ -295,6 +295,92 @@ def cross_validate(
             winner = cross_validation.write_winner(table, path / "winner.yml")
             console.print(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}", markup=False, soft_wrap=True, highlight=False)
         _stop_if_failed(failures)
+
+
+@app.command()
+def benchmark(
+    configs: Annotated[
+        list[Path], typer.Argument(help="Files of hyper-parameters, one for each variant, such as zoo_configs/aarl_state.yml.")
+    ],
+    envs: Annotated[
+        str | None, typer.Option(help="Such as cheetah-run,Pendulum-v1. Default: those that all files have an entry for.")
+    ] = None,
+    seeds: Annotated[str, typer.Option(help="Such as 0-9 or 0,3.")] = "0-9",
+    checkpoints: Annotated[
+        str | None,
+        typer.Option(
+            help="Environment steps to compare at; the last ends the training.",
+            show_default="100k,500k,1000k as far as the files' n_timesteps",
+        ),
+    ] = None,
+    every: Annotated[
+        str | None, typer.Option(help="Evaluate, and save for going on, after so many environment steps too, such as 20k.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.", min=1)] = 10,
+    workers: Workers = 1,
+    threads: Threads = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder of the benchmark; more variants, tasks and seeds may be added to it.")
+    ] = Path("runs/benchmark"),
+) -> None:
+    """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command goes on with it."""
+    with clear_errors():
+        from search.benchmark import load_benchmark, note_failures, parse_seeds, parse_steps
+
+        names = [name.strip() for name in envs.split(",")] if envs else []
+        steps = parse_steps(checkpoints) if checkpoints else ()
+        (between,) = parse_steps(every) if every else (None,)
+        grid = load_benchmark(configs, names, parse_seeds(seeds), steps, between, episodes)
+        grid.prepare(out)
+        _, failures = _train_grid(grid, out, None, workers, threads)
+        note_failures(out, failures)
+        _show_benchmark(out, None)
+        _stop_if_failed(failures)
+
+
+@app.command()
+def table(
+    folder: Annotated[Path, typer.Argument(help="Folder of a benchmark.")] = Path("runs/benchmark"),
+    number: Annotated[
+        Literal["3", "4", "6"] | None,
+        typer.Option("--table", help="Table of the paper. Default: that with most of the variants."),
+    ] = None,
+    csv: Annotated[Path | None, typer.Option(help="File to write the scores to, one line for each cell.")] = None,
+    json: Annotated[Path | None, typer.Option(help="File to write all that is shown to, and every run.")] = None,
+) -> None:
+    """Show a benchmark beside the paper's tables, with interquartile means and probabilities of improvement."""
+    with clear_errors():
+        _show_benchmark(folder, None if number is None else int(number), csv, json)
+
+
+def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, json: Path | None = None) -> None:
+    """The tables of a benchmark, and the same as files."""
+    from json import dumps
+
+    from search import table as tables
+
+    runs = tables.read_runs(folder)
+    number = tables.closest_table(runs["variant"]) if number is None else number
+    comparison = tables.compare(runs, number)
+    iqm, better = tables.interquartile_means(runs), tables.improvements(runs)
+    for shown in [*tables.score_tables(comparison), *tables.statistics_tables(iqm, better)]:
+        console.print(shown)
+    if number is not None:
+        console.print(
+            f"Paper: table {number}. ▲ ▼: the difference from it is more than two standard errors of the difference, "
+            "2 sqrt(s²/n + S²/N).",
+            highlight=False,
+        )
+    for line in tables.missing(runs):
+        console.print(line, style="red", markup=False, soft_wrap=True, highlight=False)
+    commits = tables.commits(runs)
+    if len(commits) > 1:
+        of_each = "; ".join(f"{commit} ({count})" for commit, count in commits.items())
+        console.print(f"Runs of several commits: {of_each}", style="red", markup=False, soft_wrap=True, highlight=False)
+    if csv is not None:
+        comparison.to_csv(csv, index=False)
+    if json is not None:
+        json.write_text(dumps(tables.as_data(number, comparison, iqm, better, runs), indent=1) + "\n", encoding="utf-8")
 
 
 Run = Annotated[

@@ -1,0 +1,374 @@
+"""A benchmark's runs in the layout of the paper's tables 3, 4 and 6, beside the paper's numbers, with rliable's statistics."""
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+from rich.markup import escape
+from rich.table import Table
+from scipy import stats
+
+from sb3_aarl.callbacks import read_curve
+from sb3_aarl.envs import PREFIX
+from search import operator_selection
+from search.benchmark import ABOUT, task_name
+from search.grid import comparable
+
+# Resamples of the bootstrap.
+RESAMPLES = 9999
+CONFIDENCE = 0.95
+# A difference is marked from so many standard errors on.
+STANDARD_ERRORS = 2.0
+MARKS = {"higher": "▲", "lower": "▼", "": ""}
+# The row of table 6, which has no environments.
+NORMALIZED = "normalized"
+# Tasks whose returns are on one scale, 0 to 1000.
+SUITE = "DeepMind Control"
+
+
+@cache
+def _paper() -> dict[int, dict[str, Any]]:
+    return yaml.safe_load(Path(__file__).with_name("paper_tables.yml").read_text(encoding="utf-8"))
+
+
+def paper_scores(number: int) -> pd.DataFrame:
+    """
+    A table of the paper: one row a score with ``checkpoint`` (environment steps), ``environment`` (its id), ``column`` (the
+    paper's heading), ``variant`` (the name in ``zoo_configs``, None for methods that are not here), ``mean``, ``std`` and
+    ``runs``.
+
+    :param number: 3, 4 or 6
+    :raises ValueError: for another one
+    """
+    if number not in _paper():
+        raise ValueError(f"scores are in the paper's tables {', '.join(map(str, _paper()))}, not {number}")
+    table = _paper()[number]
+    rows = []
+    for checkpoint, tasks in table["scores"].items():
+        for task, scores in tasks.items():
+            environment = task if task == NORMALIZED else f"{PREFIX}{task}-v0"
+            for (column, variant), score in zip(table["columns"].items(), scores, strict=True):
+                if score is not None:
+                    rows.append((checkpoint, environment, column, variant, *map(float, score), table["runs"]))
+    return pd.DataFrame(rows, columns=["checkpoint", "environment", "column", "variant", "mean", "std", "runs"])
+
+
+def closest_table(variants: Iterable[str]) -> int | None:
+    """
+    The paper's table with the most of some variants, None if none has any.
+
+    :param variants: Names of variants
+    """
+    names = set(variants)
+    matches = {number: len(names & set(table["columns"].values())) for number, table in _paper().items()}
+    best = max(matches, key=lambda number: matches[number])
+    return best if matches[best] else None
+
+
+def read_runs(folder: Path) -> pd.DataFrame:
+    """
+    What a benchmark's folder has: one row for each checkpoint of each run that was asked for, with ``variant``,
+    ``environment``, ``seed``, ``checkpoint`` (environment steps), ``mean`` (return; NaN if it is missing), ``reason`` (why it
+    is missing, else empty) and ``commit`` (of all sessions that trained it).
+
+    :param folder: Folder of a benchmark; runs that were copied there from another machine count too
+    :raises ValueError: when there are none
+    """
+    rows = []
+    for path in sorted(folder.glob(f"*/*/*/{ABOUT}")):
+        about = json.loads(path.read_text(encoding="utf-8"))
+        curve = path.with_name("curve.csv")
+        points = {point.environment_steps: point.mean for point in read_curve(curve)} if curve.exists() else {}
+        commits = ", ".join(dict.fromkeys(session["commit"] for session in about["sessions"]))
+        for checkpoint in about["checkpoints"]:
+            mean = points.get(checkpoint, math.nan)
+            if math.isfinite(mean):
+                reason = ""
+            elif checkpoint in points:
+                reason = f"its return is {mean}"
+            else:
+                begun = f"unfinished, evaluated up to {max(points, default=0):,}" if about["sessions"] else "not begun"
+                reason = about.get("failed", begun)
+            run = (about["variant"], about["environment"], about["seed"])
+            rows.append((*run, checkpoint, math.nan if reason else mean, reason, commits))
+    if not rows:
+        raise ValueError(f"{folder} has no runs of a benchmark")
+    columns = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
+    """
+    Means and deviations over seeds, beside the paper's.
+
+    ``std`` is the sample deviation (n - 1). A difference is marked when it exceeds two standard errors of a difference of two
+    means, 2 sqrt(s^2 / n + S^2 / N), with s and n of the runs here, S and N of the paper's table; the paper does not say
+    which deviation it prints. With one run here there is no s, and no mark.
+
+    For table 6 the returns are normalized as for table 2, see :func:`search.operator_selection.table`: the paper says for
+    neither how. N is 5 seeds x 6 environments there. Both deviations then have the difference of the environments in them,
+    which makes the test a cautious one.
+
+    :param runs: As :func:`read_runs` gives them
+    :param number: 3, 4 or 6, None for no table of the paper
+    :return: One row for each ``checkpoint``, ``environment`` and ``variant``, in the paper's order: ``asked`` and ``runs``
+        (how many were asked for, and are there), ``mean``, ``std``, ``column`` (the paper's heading), ``paper_mean``,
+        ``paper_std``, ``paper_runs``, ``difference``, ``standard_error`` and ``mark`` (``higher``, ``lower`` or empty)
+    """
+    keys = ["checkpoint", "environment", "variant"]
+    result = _normalized(runs) if number == 6 else _by_task(runs)
+    columns = [*keys, "column", "paper_mean", "paper_std", "paper_runs"]
+    if number is None:
+        paper = pd.DataFrame(columns=columns)
+        tasks, names = [], {}
+    else:
+        paper = paper_scores(number).rename(columns={name: f"paper_{name}" for name in ("mean", "std", "runs")})
+        tasks, names = list(dict.fromkeys(paper["environment"])), dict(zip(paper["variant"], paper["column"], strict=True))
+    numbers = dict.fromkeys(columns[-3:], float)
+    result = result.merge(paper.drop(columns="column").astype(numbers), on=keys, how="left")
+    result["column"] = [names.get(variant, variant) for variant in result["variant"]]
+    result["difference"] = result["mean"] - result["paper_mean"]
+    variance = result["std"] ** 2 / result["runs"] + result["paper_std"] ** 2 / result["paper_runs"]
+    result["standard_error"] = np.sqrt(variance)
+    far = result["difference"].abs() > STANDARD_ERRORS * result["standard_error"]
+    result["mark"] = np.where(far, np.where(result["difference"] > 0, "higher", "lower"), "")
+    order = {
+        "environment": [*tasks, *(name for name in dict.fromkeys(runs["environment"]) if name not in tasks)],
+        "variant": [*names, *(name for name in dict.fromkeys(runs["variant"]) if name not in names)],
+    }
+    places = {key: {name: place for place, name in enumerate(values)} for key, values in order.items()}
+    result = result.sort_values(
+        keys, key=lambda column: column.map(places[str(column.name)]) if column.name in places else column
+    )
+    return result[[*keys, "asked", "runs", "mean", "std", *columns[3:], "difference", "standard_error", "mark"]].reset_index(
+        drop=True
+    )
+
+
+def _by_task(runs: pd.DataFrame) -> pd.DataFrame:
+    grouped = runs.groupby(["checkpoint", "environment", "variant"])["mean"]
+    summary = {"asked": grouped.size(), "runs": grouped.count(), "mean": grouped.mean(), "std": grouped.std(ddof=1)}
+    return pd.DataFrame(summary).reset_index()
+
+
+def _normalized(runs: pd.DataFrame) -> pd.DataFrame:
+    """Each variant's mean over all environments; only variants that have all runs can be normalized together."""
+    parts = []
+    for checkpoint, all_of in runs.groupby("checkpoint"):
+        asked = all_of.groupby("variant").size().rename("asked")
+        there = comparable(all_of.dropna(subset="mean")).rename(columns={"mean": "last"})
+        table = operator_selection.table(there).reindex(asked.index).assign(asked=asked, checkpoint=checkpoint)
+        table["runs"] = table["runs"].fillna(0).astype(int)
+        # It gives the deviation of the population.
+        table["std"] *= np.sqrt(table["runs"] / (table["runs"] - 1).where(table["runs"] > 1))
+        parts.append(table.reset_index().assign(environment=NORMALIZED))
+    return pd.concat(parts, ignore_index=True)
+
+
+def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
+    """
+    Interquartile mean (IQM) of the returns with a 95 % interval by stratified bootstrap (Agarwal et al. 2021, rliable):
+    percentiles over resamples of the seeds within each task.
+
+    The IQM is over returns as they are, so only over tasks of one scale: those of DeepMind Control (0 to 1000) together,
+    each other environment for itself. Only tasks count that all variants of the checkpoint have runs on.
+
+    :param runs: As :func:`read_runs` gives them
+    :param n_resamples: Resamples of the bootstrap
+    :return: One row for each ``checkpoint``, ``tasks`` (of which scale) and ``variant``: ``n_tasks``, ``asked``, ``runs``,
+        ``iqm``, ``low`` and ``high`` (NaN where a task has one run only)
+    """
+    rows = []
+    scale = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
+    for (checkpoint, tasks), of_scale in runs.groupby(["checkpoint", scale], sort=False):
+        common, scores = _scores(of_scale)
+        for variant, samples in scores.items():
+            if not common:
+                continue
+            asked = of_scale[(of_scale["variant"] == variant) & of_scale["environment"].isin(common)]
+            interval = _interval(samples, _iqm, n_resamples)
+            runs_there = sum(map(len, samples))
+            rows.append((checkpoint, tasks, variant, len(common), len(asked), runs_there, _iqm(*samples), *interval))
+    columns = ["checkpoint", "tasks", "variant", "n_tasks", "asked", "runs", "iqm", "low", "high"]
+    return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
+
+
+def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
+    """
+    Probability that a run of one variant is better than one of another on the same task, a tie being half, as the mean over
+    all tasks that all variants have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap.
+
+    :param runs: As :func:`read_runs` gives them
+    :param n_resamples: Resamples of the bootstrap
+    :return: One row for each ``checkpoint``, ``variant`` and ``over``: ``n_tasks``, ``probability``, ``low`` and ``high``
+    """
+    rows = []
+    for checkpoint, of_checkpoint in runs.groupby("checkpoint"):
+        common, scores = _scores(of_checkpoint)
+        for variant, samples in scores.items():
+            for over, others in scores.items():
+                if variant != over and common:
+                    interval = _interval([*samples, *others], _improvement, n_resamples)
+                    rows.append((checkpoint, variant, over, len(common), _improvement(*samples, *others), *interval))
+    return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high"])
+
+
+def _scores(runs: pd.DataFrame) -> tuple[list[str], dict[str, list[np.ndarray]]]:
+    """Tasks that all variants have runs on, and for each variant the scores on each of them."""
+    there = runs.dropna(subset="mean")
+    tasks = there.groupby("environment")["variant"].nunique()
+    common = [str(name) for name, n_variants in tasks.items() if n_variants == runs["variant"].nunique()]
+    scores = {
+        (variant, task): group.to_numpy() for (variant, task), group in there.groupby(["variant", "environment"])["mean"]
+    }
+    variants = [str(name) for name in dict.fromkeys(runs["variant"])] if common else []
+    return common, {variant: [scores[variant, task] for task in common] for variant in variants}
+
+
+def _iqm(*samples: np.ndarray, axis: int = -1) -> Any:
+    return stats.trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
+
+
+def _improvement(*samples: np.ndarray, axis: int = -1) -> Any:
+    """Of the first half of the samples over the second."""
+    n_tasks = len(samples) // 2
+    per_task = []
+    for ours, others in zip(samples[:n_tasks], samples[n_tasks:], strict=True):
+        ours, others = ours[..., :, None], others[..., None, :]
+        per_task.append(((ours > others) + 0.5 * (ours == others)).mean(axis=(-2, -1)))
+    return np.mean(per_task, axis=0)
+
+
+def _interval(samples: Sequence[np.ndarray], statistic: Any, n_resamples: int) -> tuple[float, float]:
+    """rliable's own bootstrap needs an ``arch`` that pandas 3 breaks; scipy's, with a sample for each stratum, is the same."""
+    if min(map(len, samples)) < 2:
+        return math.nan, math.nan
+    bootstrap = partial(stats.bootstrap, vectorized=True, method="percentile", confidence_level=CONFIDENCE, batch=1000)
+    result = bootstrap(samples, statistic, n_resamples=n_resamples, rng=np.random.default_rng(0))
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def missing(runs: pd.DataFrame) -> list[str]:
+    """
+    What is asked for and not there, one line for each reason, run by run.
+
+    :param runs: As :func:`read_runs` gives them
+    """
+    lines = []
+    keys = ["checkpoint", "variant", "environment", "reason"]
+    for (checkpoint, variant, environment, reason), group in runs[runs["reason"] != ""].groupby(keys):
+        seeds = ", ".join(map(str, sorted(group["seed"])))
+        noun = "seed" if len(group) == 1 else "seeds"
+        lines.append(f"Missing at {checkpoint:,}: {variant} on {task_name(str(environment))}, {noun} {seeds}: {reason}")
+    return lines
+
+
+def commits(runs: pd.DataFrame) -> dict[str, int]:
+    """
+    How many runs were trained with which commits.
+
+    :param runs: As :func:`read_runs` gives them
+    """
+    of_runs = runs[runs["commit"] != ""].drop_duplicates(["variant", "environment", "seed"])["commit"]
+    return {str(commit): int(count) for commit, count in of_runs.value_counts().items()}
+
+
+def score_tables(comparison: pd.DataFrame) -> list[Table]:
+    """
+    The layout of the paper: for each checkpoint tasks as rows, variants as columns, the paper's score beside each.
+
+    :param comparison: As :func:`compare` gives it
+    """
+    tables = []
+    for checkpoint, part in comparison.groupby("checkpoint"):
+        table = Table("", title=f"{_steps(checkpoint)} steps scores")
+        headings = dict(zip(part["variant"], part["column"], strict=True))
+        in_paper = set(part.dropna(subset="paper_mean")["variant"])
+        for variant, heading in headings.items():
+            table.add_column(escape(variant if heading == variant else f"{heading}\n{variant}"), justify="right")
+            if variant in in_paper:
+                table.add_column("paper", justify="right", style="dim")
+        for environment, of_task in part.groupby("environment", sort=False):
+            rows = {row["variant"]: row for row in of_task.to_dict("records")}
+            cells = []
+            for variant in headings:
+                row = rows.get(variant)
+                cells.append("" if row is None else _own_score(row))
+                if variant in in_paper:
+                    cells.append("" if row is None else _score(row["environment"], row["paper_mean"], row["paper_std"]))
+            table.add_row(task_name(str(environment)), *cells)
+        tables.append(table)
+    return tables
+
+
+def statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
+    """
+    The statistics over tasks.
+
+    :param iqm: As :func:`interquartile_means` gives them
+    :param better: As :func:`improvements` gives them
+    """
+    tables = []
+    for checkpoint, part in iqm.groupby("checkpoint"):
+        table = Table("", "variant", "IQM", "95 % interval", "runs", title=f"Interquartile means at {_steps(checkpoint)}")
+        for row in part.to_dict("records"):
+            scale = f"{row['n_tasks']} tasks of {SUITE}" if row["tasks"] == SUITE else row["tasks"]
+            interval = _range(row["low"], row["high"], ".1f")
+            table.add_row(scale, escape(row["variant"]), f"{row['iqm']:.1f}", interval, f"{row['runs']}/{row['asked']}")
+        tables.append(table)
+    for checkpoint, part in better.groupby("checkpoint"):
+        variants = [str(variant) for variant in dict.fromkeys(part["variant"])]
+        title = f"Probability that a run of the row is better than one of the column, at {_steps(checkpoint)}"
+        table = Table("", *map(escape, variants), title=title)
+        cells = {
+            (row["variant"], row["over"]): f"{row['probability']:.2f} {_range(row['low'], row['high'], '.2f')}"
+            for row in part.to_dict("records")
+        }
+        for variant in variants:
+            table.add_row(escape(variant), *(cells.get((variant, over), "") for over in variants))
+        tables.append(table)
+    return tables
+
+
+def as_data(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, better: pd.DataFrame, runs: pd.DataFrame) -> dict:
+    """
+    Everything that is shown, in plain values for JSON.
+
+    :param number: Table of the paper
+    :param comparison: As :func:`compare` gives it
+    :param iqm: As :func:`interquartile_means` gives them
+    :param better: As :func:`improvements` gives them
+    :param runs: As :func:`read_runs` gives them
+    """
+    frames = {"scores": comparison, "interquartile_means": iqm, "improvements": better, "runs": runs}
+    records = {name: json.loads(frame.to_json(orient="records", double_precision=15)) for name, frame in frames.items()}
+    return {"table": number, **records, "missing": missing(runs), "commits": commits(runs)}
+
+
+def _steps(checkpoint: Any) -> str:
+    return f"{checkpoint // 1000}K" if checkpoint % 1000 == 0 else f"{checkpoint:,}"
+
+
+def _score(environment: str, mean: float, std: float) -> str:
+    """As the paper prints it: integers, but three digits of what is normalized."""
+    if math.isnan(mean):
+        return "-"
+    digits = 0 if environment.startswith(PREFIX) else 3 if max(abs(mean), std) < 10 else 1
+    return f"{mean:.{digits}f}" if math.isnan(std) else f"{mean:.{digits}f} ± {std:.{digits}f}"
+
+
+def _own_score(row: dict[Any, Any]) -> str:
+    """With the number of runs where it is not what was asked for, and the mark."""
+    number = "" if row["runs"] == row["asked"] else f" ({row['runs']}/{row['asked']})"
+    return f"{_score(row['environment'], row['mean'], row['std'])}{number} {MARKS[row['mark']]}".rstrip()
+
+
+def _range(low: float, high: float, digits: str) -> str:
+    # A backslash: rich would take brackets for markup.
+    return "-" if math.isnan(low) else rf"\[{low:{digits}}, {high:{digits}}]"
