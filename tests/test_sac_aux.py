@@ -475,7 +475,9 @@ def moved_by_train(model: SACAux, gradient_steps: int = 1) -> set[str]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("settings", [{}, {"joint_optimizer": True}, {"predictor_batch_norm": True}], ids=name)
+@pytest.mark.parametrize(
+    "settings", [{}, {"joint_optimizer": True}, {"predictor_batch_norm": True}, {"precision": "bf16"}], ids=name
+)
 def test_what_a_step_moves(kind: str, settings: dict[str, Any]) -> None:
     model = filled_model(kind, policy_delay=3, target_update_interval=2, **settings)
     every = {"encoder", "q", "head"}
@@ -657,6 +659,8 @@ def resumable_env(variant: str) -> Any:
         ("state-normalized", 80, {}),
         ("state-sde", 80, {"use_sde": True, "ent_coef": 0.1, "n_steps": 3}),
         ("state-small", 80, {"buffer_size": 70}),
+        ("state-bf16", 80, {"precision": "bf16"}),
+        ("pixels-bf16", 40, {"precision": "bf16", "augmentation": "random_crop"}),
         ("dict", 40, {}),
         ("pixels", 60, {"augmentation": "random_crop"}),
         ("pixels-stack", 60, {"augmentation": "random_shift"}),
@@ -835,6 +839,8 @@ def test_policy_kwargs_name_the_augmentation_too(argument: dict[str, Any], tmp_p
         ("state", {"aux_coef": float("nan")}, r"aux_coef must be a finite number of at least 0, not nan"),
         ("state", {"aux_coef": -1.0}, r"aux_coef must be a finite number of at least 0, not -1"),
         ("state", {"aux_coef": float("inf")}, r"aux_coef must be a finite number"),
+        ("state", {"precision": "fp16"}, r"precision must be fp32 or bf16, not 'fp16'"),
+        ("state", {"compile": "inductor"}, r"compile must be None or cudagraphs, not 'inductor'"),
         ("state", {"augmentation": "flip"}, r"unknown augmentation 'flip', expected one of auto, random_crop"),
         ("pixels", {"augmentation": "random_crop", "crop_size": 19}, r"18 x 20 pixels are smaller than the crop of 19 x 19"),
         ("pixels", {"crop_size": 19}, r"18 x 20 pixels are smaller than the crop of 19 x 19"),

@@ -1,0 +1,208 @@
+"""The gradient step in bfloat16, as a CUDA graph, with fused optimizers, from storage elsewhere: still the same step."""
+
+import copy
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from test_sac_aux import KINDS, assert_same, everything, filled_model, make_model
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sb3_aarl.cuda_graph import _key, _leaves, _map
+from sb3_aarl.sac_aux import NonFiniteError
+
+PRODUCTS = {"aten.mm", "aten.addmm", "aten.convolution", "aten.convolution_backward"}
+needs_cuda = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a CUDA device")
+
+
+class Operations(TorchDispatchMode):
+    """The data types that operations were given, by name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: dict[str, set[th.dtype]] = {}
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        inputs = {arg.dtype for arg in args if isinstance(arg, th.Tensor) and arg.is_floating_point()}
+        self.seen.setdefault(str(function).rpartition(".")[0], set()).update(inputs)
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bfloat16_is_what_networks_compute_in_and_nothing_else(kind: str) -> None:
+    model = filled_model(kind, precision="bf16", policy_delay=1, aux_loss="{s_t, a_t} -> {s_t+1, r_t} [bilinear, negatives]")
+    outputs: dict[str, th.dtype] = {}
+    model.critic.q_networks[0].register_forward_hook(lambda *call: outputs.update(q=call[-1].dtype))
+    model.aux_head.predictor.register_forward_hook(lambda *call: outputs.update(predictor=call[-1].dtype))
+    losses: list[th.Tensor] = []
+    model.aux_head.operator.register_forward_hook(lambda module, args, loss: losses.extend([*args, loss]))
+    with Operations() as operations:
+        model.train(2, batch_size=16)
+
+    assert outputs == {"q": th.bfloat16, "predictor": th.bfloat16}
+    products = {name: operations.seen[name] for name in PRODUCTS & operations.seen.keys()}
+    # The similarity of predictions and targets is part of the loss, and stays float32.
+    assert products.pop("aten.mm") == {th.bfloat16, th.float32}
+    assert products and all(dtypes == {th.bfloat16} for dtypes in products.values())
+    assert {tensor.dtype for tensor in losses} == {th.float32}
+    for name in ("aten.mse_loss", "aten.log", "aten.exp", "aten._fused_adam_"):
+        assert operations.seen[name] <= {th.float32}, name
+    for tensor in (value for value in everything(model).values() if isinstance(value, th.Tensor)):
+        assert tensor.dtype == th.float32
+    for parameter in (*model.critic.parameters(), *model.aux_head.parameters(), *model.actor.own_parameters()):
+        assert parameter.grad is not None and parameter.grad.dtype == th.float32
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bfloat16_gives_almost_the_same_gradients(kind: str) -> None:
+    gradients, logs = [], []
+    for precision in ("fp32", "bf16"):
+        rates: dict[str, float] = {"learning_rate": 0.0, "encoder_learning_rate": 0.0, "ent_coef_learning_rate": 0.0}
+        model = filled_model(kind, precision=precision, policy_delay=1, **rates)
+        model.train(1, batch_size=128)
+        trained = {
+            "encoder": model.critic.features_extractor.parameters(),
+            "q": model._q_parameters(model.critic),
+            "actor": model.actor.own_parameters(),
+            "head": model.aux_head.parameters(),
+            "ent_coef": [model.log_ent_coef],
+        }
+        gradients.append({name: th.cat([p.grad.flatten() for p in those]) for name, those in trained.items()})
+        logs.append({key: value for key, value in model.logger.name_to_value.items() if "loss" in key})
+    for name, exact in gradients[0].items():
+        assert th.cosine_similarity(exact, gradients[1][name], dim=0) > 0.995, name
+        assert not th.equal(exact, gradients[1][name])
+        assert exact.norm().item() == pytest.approx(gradients[1][name].norm().item(), rel=0.02)
+    for name, value in logs[0].items():
+        assert logs[1][name] == pytest.approx(value, rel=0.02, abs=1e-3), name
+
+
+def test_bfloat16_predicts_and_is_saved_in_float32(tmp_path: Any) -> None:
+    model = make_model(precision="bf16").learn(60)
+    model.save(tmp_path / "model")
+    exact = type(model).load(tmp_path / "model", precision="fp32", device="cpu")
+    assert exact.precision == "fp32"
+    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    assert_same(model.predict(observations, deterministic=True)[0], exact.predict(observations, deterministic=True)[0])
+
+
+def test_bfloat16_learns_as_float32_does() -> None:
+    """The auxiliary loss and the critic loss after some hundred steps on the same data."""
+    found: dict[str, list[float]] = {"fp32": [], "bf16": []}
+    for precision, values in found.items():
+        model = filled_model(steps=280, precision=precision, learning_rate=1e-3)
+        model.train(5, batch_size=64)
+        before = dict(model.logger.name_to_value)
+        model.train(300, batch_size=64)
+        model.train(50, batch_size=64)
+        after = model.logger.name_to_value
+        assert after["train/aux_loss"] < 0.5 * before["train/aux_loss"]
+        values += [after["train/aux_loss"], after["train/critic_loss"]]
+    assert found["bf16"] == pytest.approx(found["fp32"], rel=0.3)
+
+
+@pytest.mark.parametrize("given", [{}, {"foreach": True}, {"fused": False}, {"eps": 1e-3}], ids=str)
+def test_adam_is_fused_unless_the_user_says_how(given: dict[str, Any]) -> None:
+    model = make_model(policy_kwargs={"optimizer_kwargs": given})
+    for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer):
+        assert optimizer.defaults["fused"] == (given.get("fused") if {"foreach", "fused"} & set(given) else True)
+        assert optimizer.defaults["eps"] == given.get("eps", 1e-8)
+    assert "fused" not in given or given == {"fused": False}  # the user's dict is not written to
+    identity = {"features_extractor_class": "identity", "features_extractor_kwargs": {}}
+    assert not make_model(policy_kwargs=identity, aux_loss=None).critic.optimizer.defaults["fused"]
+    momentum = {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.5}}
+    assert isinstance(make_model(policy_kwargs=momentum).critic.optimizer, th.optim.SGD)
+
+
+def test_cuda_graphs_without_cuda_are_one_line_of_log(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        graphed = make_model(compile="cudagraphs").learn(60)
+    assert [record.getMessage() for record in caplog.records] == [
+        "compile='cudagraphs' needs a CUDA device, not cpu: the gradient step runs as without"
+    ]
+    assert_same(everything(graphed), everything(make_model().learn(60)))
+
+
+def test_tf32_is_allowed_in_training_only() -> None:
+    before = th.backends.cuda.matmul.allow_tf32, th.backends.cudnn.allow_tf32
+    for allowed in (True, False, None):
+        model = filled_model(allow_tf32=allowed)
+        seen = []
+        model.aux_head.register_forward_hook(
+            lambda *_, seen=seen: seen.append((th.backends.cuda.matmul.allow_tf32, th.backends.cudnn.allow_tf32))
+        )
+        model.train(2, batch_size=16)
+        assert seen == [before if allowed is None else (allowed, allowed)] * 2
+        assert (th.backends.cuda.matmul.allow_tf32, th.backends.cudnn.allow_tf32) == before
+
+
+def test_a_loss_that_is_found_not_finite_afterwards_names_its_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU losses are looked at when all gradient steps are done."""
+    model = filled_model()
+    step, calls = model._gradient_step, []
+
+    def third_is_infinite(*arguments: Any) -> dict[str, th.Tensor]:
+        logs = step(*arguments)
+        calls.append(logs)
+        return logs | ({"critic_loss": th.tensor(float("inf"))} if len(calls) == 3 else {})
+
+    monkeypatch.setattr(model, "_gradient_step", third_is_infinite)
+    with pytest.raises(NonFiniteError, match=r"critic_loss is inf at gradient step 3, .*auxiliary loss: \{s_t"):
+        model.train(5, batch_size=16)
+    assert len(calls) == 5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_in_a_tensor_give_the_same_training(kind: str) -> None:
+    """The storage of a GPU, on the CPU."""
+    plain = make_model(kind).learn(60)
+    there = make_model(kind, replay_buffer_kwargs={"storage_device": "cpu"}).learn(60)
+    assert isinstance(next(iter(there.replay_buffer.stores.values())).frames, th.Tensor)
+    assert_same(everything(there), everything(plain))
+
+
+def test_what_a_recording_depends_on() -> None:
+    model = filled_model("dict")
+    batch, windows = model._draw(16)
+    arguments = (batch, windows, True, False)
+    copied = _map(th.clone, arguments)
+    assert type(copied[0]) is type(batch) and type(copied[1]) is type(windows) and copied[2:] == (True, False)
+    leaves = list(_leaves(arguments))
+    assert len(leaves) == 2 + 2 + 3 + 2 + 2  # two keys of both observations, actions, dones, rewards; of windows
+    for one, other in zip(leaves, _leaves(copied), strict=True):
+        assert one is not other and th.equal(one, other)
+    assert _key(arguments) == _key(copied) == _key((*model._draw(16), True, False))
+    others = [(batch, windows, False, False), (batch, None, True, False), (*model._draw(15), True, False)]
+    assert len({_key(arguments), *map(_key, others)}) == 4
+
+
+@needs_cuda
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_a_cuda_graph_is_the_eager_step(kind: str, precision: str) -> None:
+    """Over 20 steps with the same data and the same noise; also with a learning rate that changes."""
+    states = []
+    for mode in (None, "cudagraphs"):
+        model = filled_model(
+            kind, precision=precision, compile=mode, device="cuda", learning_rate=lambda left: 1e-3 * left, allow_tf32=False
+        )
+        np.random.seed(0)
+        th.manual_seed(0)
+        for i in range(20):
+            model._current_progress_remaining = 1 - i / 40
+            model.train(1, batch_size=16)
+        states.append(copy.deepcopy(everything(model)))
+        assert mode is None or (model._graphed_step.works and model._graphed_step.recordings)
+    for name, value in states[0].items():
+        if isinstance(value, th.Tensor):
+            th.testing.assert_close(states[1][name], value, rtol=1e-2, atol=1e-3)
+
+
+@needs_cuda
+def test_storage_on_the_gpu() -> None:
+    model = make_model("pixels", device="cuda", replay_buffer_kwargs={"storage_device": "cuda"}).learn(60)
+    batch, windows = model._draw(16)
+    assert batch.observations.is_cuda and windows.observations.is_cuda
+    assert model.replay_buffer.stores[""].frames.is_cuda
