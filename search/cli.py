@@ -363,6 +363,10 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
     number = tables.closest_table(runs["variant"]) if number is None else number
     comparison = tables.compare(runs, number)
     iqm, better = tables.interquartile_means(runs), tables.improvements(runs)
+    if csv is not None:
+        comparison.to_csv(csv, index=False)
+    if json is not None:
+        json.write_text(dumps(tables.as_data(number, comparison, iqm, better, runs), indent=1) + "\n", encoding="utf-8")
     for shown in [*tables.score_tables(comparison), *tables.statistics_tables(iqm, better)]:
         console.print(shown)
     if number is not None:
@@ -377,10 +381,6 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
     if len(commits) > 1:
         of_each = "; ".join(f"{commit} ({count})" for commit, count in commits.items())
         console.print(f"Runs of several commits: {of_each}", style="red", markup=False, soft_wrap=True, highlight=False)
-    if csv is not None:
-        comparison.to_csv(csv, index=False)
-    if json is not None:
-        json.write_text(dumps(tables.as_data(number, comparison, iqm, better, runs), indent=1) + "\n", encoding="utf-8")
 
 
 Run = Annotated[

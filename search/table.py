@@ -177,7 +177,8 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
     percentiles over resamples of the seeds within each task.
 
     The IQM is over returns as they are, so only over tasks of one scale: those of DeepMind Control (0 to 1000) together,
-    each other environment for itself. Only tasks count that all variants of the checkpoint have runs on.
+    each other environment for itself. Only tasks count that all variants of the checkpoint have runs on; variants without
+    any run are left out.
 
     :param runs: As :func:`read_runs` gives them
     :param n_resamples: Resamples of the bootstrap
@@ -202,7 +203,7 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
 def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
     """
     Probability that a run of one variant is better than one of another on the same task, a tie being half, as the mean over
-    all tasks that all variants have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap.
+    all tasks that all of them have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap.
 
     :param runs: As :func:`read_runs` gives them
     :param n_resamples: Resamples of the bootstrap
@@ -220,14 +221,14 @@ def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFra
 
 
 def _scores(runs: pd.DataFrame) -> tuple[list[str], dict[str, list[np.ndarray]]]:
-    """Tasks that all variants have runs on, and for each variant the scores on each of them."""
+    """Tasks that all variants that have any run have runs on, and for each of these the scores on each of them."""
     there = runs.dropna(subset="mean")
     tasks = there.groupby("environment")["variant"].nunique()
-    common = [str(name) for name, n_variants in tasks.items() if n_variants == runs["variant"].nunique()]
+    common = [str(name) for name, n_variants in tasks.items() if n_variants == there["variant"].nunique()]
     scores = {
         (variant, task): group.to_numpy() for (variant, task), group in there.groupby(["variant", "environment"])["mean"]
     }
-    variants = [str(name) for name in dict.fromkeys(runs["variant"])] if common else []
+    variants = [str(name) for name in dict.fromkeys(there["variant"])] if common else []
     return common, {variant: [scores[variant, task] for task in common] for variant in variants}
 
 
@@ -262,8 +263,9 @@ def missing(runs: pd.DataFrame) -> list[str]:
     """
     lines = []
     keys = ["checkpoint", "variant", "environment", "reason"]
-    for (checkpoint, variant, environment, reason), group in runs[runs["reason"] != ""].groupby(keys):
-        seeds = ", ".join(map(str, sorted(group["seed"])))
+    ordered = runs[runs["reason"] != ""].sort_values([*keys[:3], "seed"])
+    for (checkpoint, variant, environment, reason), group in ordered.groupby(keys, sort=False):
+        seeds = ", ".join(map(str, group["seed"]))
         noun = "seed" if len(group) == 1 else "seeds"
         lines.append(f"Missing at {checkpoint:,}: {variant} on {task_name(str(environment))}, {noun} {seeds}: {reason}")
     return lines
@@ -318,7 +320,7 @@ def statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
     for checkpoint, part in iqm.groupby("checkpoint"):
         table = Table("", "variant", "IQM", "95 % interval", "runs", title=f"Interquartile means at {_steps(checkpoint)}")
         for row in part.to_dict("records"):
-            scale = f"{row['n_tasks']} tasks of {SUITE}" if row["tasks"] == SUITE else row["tasks"]
+            scale = f"{SUITE}, {row['n_tasks']} tasks" if row["n_tasks"] > 1 else row["tasks"]
             interval = _range(row["low"], row["high"], ".1f")
             table.add_row(scale, escape(row["variant"]), f"{row['iqm']:.1f}", interval, f"{row['runs']}/{row['asked']}")
         tables.append(table)

@@ -1,0 +1,343 @@
+"""Tables of a benchmark: the paper's numbers, means, deviations, intervals and marks, and what is missing."""
+
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+from sb3_aarl.callbacks import Evaluation, write_curve
+from sb3_aarl.envs import env_ids
+from search import table
+from search.benchmark import ABOUT, run_folder
+from search.cli import app
+from search.grid import Cell
+
+# The paper's tables as its text has them; table 3 and the first part of table 4 have the asterisks and daggers left out.
+PAPER = {
+    (3, 500_000): """
+AARL-Pixel | CURL | PlaNet | Dreamer | SAC+AE | SLACv1 | Pixel SAC
+Finger-Spin | 983 ± 4 | 926 ± 45 | 561 ± 284 | 796 ± 183 | 884 ± 128 | 673 ± 92 | 282 ± 102
+Cartpole-Swingup | 864 ± 19 | 841 ± 45 | 475 ± 71 | 762 ± 27 | 735 ± 63 | - | 344 ± 104
+Reacher-Easy | 938 ± 46 | 929 ± 44 | 210 ± 390 | 793 ± 164 | 627 ± 58 | - | 312 ± 132
+Cheetah-Run | 613 ± 39 | 518 ± 28 | 305 ± 131 | 570 ± 253 | 550 ± 34 | 640 ± 19 | 99 ± 28
+Walker-Walk | 917 ± 18 | 902 ± 43 | 351 ± 58 | 897 ± 49 | 847 ± 48 | 842 ± 51 | 76 ± 44
+Ball in cup-Catch | 970 ± 8 | 959 ± 27 | 460 ± 380 | 897 ± 87 | 794 ± 58 | 852 ± 71 | 200 ± 114
+""",
+    (3, 100_000): """
+AARL-Pixel | CURL | PlaNet | Dreamer | SAC+AE | SLACv1 | Pixel SAC
+Finger-Spin | 872 ± 27 | 767 ± 56 | 136 ± 216 | 341 ± 70 | 740 ± 64 | 693 ± 141 | 160 ± 138
+Cartpole-Swingup | 815 ± 66 | 582 ± 146 | 297 ± 39 | 326 ± 27 | 311 ± 11 | - | 243 ± 19
+Reacher-Easy | 778 ± 164 | 538 ± 223 | 20 ± 50 | 314 ± 155 | 274 ± 14 | - | 277 ± 69
+Cheetah-Run | 449 ± 34 | 299 ± 48 | 138 ± 88 | 235 ± 137 | 267 ± 24 | 319 ± 56 | 128 ± 12
+Walker-Walk | 510 ± 151 | 403 ± 24 | 224 ± 48 | 277 ± 12 | 394 ± 22 | 361 ± 73 | 127 ± 28
+Ball in cup-Catch | 862 ± 167 | 769 ± 43 | 0 ± 0 | 246 ± 174 | 391 ± 82 | 512 ± 110 | 100 ± 90
+""",
+    (4, 100_000): """
+AARL-State | SAC-Identity | SAC | CURL
+Finger-Spin | 837 ± 52 | 805 ± 32 | 785 ± 106 | 712 ± 83
+Finger-Turn hard | 218 ± 117 | 347 ± 150 | 174 ± 94 | 43 ± 42
+Cartpole-Swingup | 877 ± 5 | 873 ± 10 | 866 ± 7 | 854 ± 17
+Cartpole-Swingup sparse | 695 ± 147 | 455 ± 359 | 627 ± 307 | 446 ± 196
+Reacher-Easy | 934 ± 38 | 697 ± 192 | 874 ± 87 | 749 ± 183
+Cheetah-Run | 472 ± 30 | 237 ± 27 | 172 ± 29 | 190 ± 32
+Walker-Stand | 948 ± 7 | 940 ± 10 | 862 ± 196 | 767 ± 104
+Walker-Walk | 906 ± 78 | 873 ± 89 | 925 ± 22 | 852 ± 64
+Walker-Run | 564 ± 45 | 559 ± 34 | 403 ± 43 | 289 ± 61
+Ball in cup-Catch | 965 ± 7 | 954 ± 12 | 962 ± 13 | 941 ± 32
+Fish-Upright | 498 ± 88 | 471 ± 62 | 400 ± 62 | 295 ± 117
+Hopper-Stand | 311 ± 177 | 14 ± 16 | 26 ± 40 | 6 ± 3
+""",
+    (4, 1_000_000): """
+AARL-State | SAC-Identity | SAC | CURL
+Quadraped-Run | 838 ± 58 | 345 ± 157 | 707 ± 148 | 497 ± 128
+Pendulum-Swingup | 579 ± 410 | 506 ± 374 | 379 ± 391 | 363 ± 366
+Hopper-Hop | 278 ± 106 | 121 ± 51 | 134 ± 93 | 60 ± 22
+Humanoid-Stand | 286 ± 15 | 9 ± 2 | 7 ± 1 | 7 ± 1
+Humanoid-Walk | 299 ± 55 | 16 ± 28 | 2 ± 0 | 2 ± 0
+Humanoid-Run | 88 ± 2 | 1 ± 0 | 1 ± 0 | 1 ± 0
+""",
+    (6, 100_000): """
+AARL-MLP (1-layer) | AARL-MLP (4-layer) | AARL-DenseMLP (1-layer) | AARL-DenseMLP (4-layer)
+normalized | 0.919 ± 0.217 | 0.544 ± 0.360 | 1.000 ± 0.129 | 0.813 ± 0.218
+""",
+}
+CHEETAH, WALKER, FISH = (f"dm_control/{task}-v0" for task in ("cheetah-run", "walker-walk", "fish-upright"))
+runner = CliRunner(env={"COLUMNS": "250", "TERM": "dumb"})
+
+
+def environment_id(task: str) -> str:
+    """The id of what the paper calls "Ball in cup-Catch" or "Finger-Turn hard"."""
+    if task == "normalized":
+        return task
+    return f"dm_control/{task.lower().replace(' ', '_').replace('quadraped', 'quadruped')}-v0"
+
+
+@pytest.mark.parametrize("number", [3, 4, 6])
+def test_the_papers_scores_are_those_that_it_prints(number: int) -> None:
+    printed = set()
+    for (of_table, checkpoint), text in PAPER.items():
+        headings, *rows = ([cell.strip() for cell in line.split("|")] for line in text.strip().splitlines())
+        for task, *scores in rows:
+            for column, score in zip(headings, scores, strict=True):
+                if of_table == number and score != "-":
+                    printed.add((checkpoint, environment_id(task), column, *map(float, score.split("±"))))
+    scores = table.paper_scores(number)
+    columns = ["checkpoint", "environment", "column", "mean", "std"]
+    assert len(scores) == len(printed)
+    assert set(scores[columns].itertuples(index=False, name=None)) == printed
+    assert set(scores["runs"]) == {{3: 10, 4: 10, 6: 30}[number]}
+    assert set(scores["environment"]) <= {*env_ids(), "normalized"}
+    zoo = {path.stem for path in (Path(__file__).parent.parent / "zoo_configs").glob("*.yml")}
+    assert set(scores["variant"].dropna()) <= zoo
+
+
+@pytest.mark.parametrize(
+    ("variants", "number"),
+    [
+        (["aarl_state"], 4),
+        (["aarl_state", "mine"], 4),
+        (["aarl_state", "aarl_mlp_1"], 6),
+        (["curl_pixel"], 3),
+        (["mine"], None),
+    ],
+    ids=str,
+)
+def test_the_table_with_the_most_variants_is_shown(variants: list[str], number: int | None) -> None:
+    assert table.closest_table(variants) == number
+
+
+def plant(folder: Path, cell: Cell, curve: Mapping[int, float], checkpoints: Sequence[int] = (100_000,), **about: Any) -> None:
+    """A run as a benchmark leaves it."""
+    path = run_folder(folder, cell)
+    path.mkdir(parents=True)
+    if curve:
+        write_curve(path / "curve.csv", [Evaluation(steps, mean, 1.0, 10, 2.0) for steps, mean in curve.items()])
+    session = {"commit": "c0ffee"}
+    values = {**cell._asdict(), "checkpoints": list(checkpoints), "sessions": [session], **about}
+    (path / ABOUT).write_text(json.dumps(values))
+
+
+def plant_scores(folder: Path, scores: Mapping[tuple[str, str], np.ndarray]) -> None:
+    """Runs with these returns at 100k, one for each seed, by variant and environment."""
+    for (variant, environment), of_seeds in scores.items():
+        for seed, score in enumerate(of_seeds):
+            plant(folder, Cell(variant, environment, seed), {100_000: float(score)})
+
+
+def test_means_deviations_and_marks(tmp_path: Path) -> None:
+    # Ten runs each, around the paper's mean plus so many standard errors, by Welch's statistic as scipy has it.
+    spread = np.array([-9.0, -7.0, -4.0, -3.0, -1.0, 0.0, 2.0, 5.0, 7.0, 10.0]) * 6
+    paper = table.paper_scores(4).set_index(["checkpoint", "environment", "variant"]).loc[100_000]
+    gaps = dict(
+        zip(
+            itertools.product([CHEETAH, WALKER, FISH], ["aarl_state", "sac_identity"]),
+            [-2.01, -1.99, 0, 1.99, 2.01, 9],
+            strict=True,
+        )
+    )
+    scores = {}
+    for (environment, variant), gap in gaps.items():
+        mean, std, _ = paper.loc[(environment, variant), ["mean", "std", "runs"]]
+        error = math.sqrt(spread.var(ddof=1) / 10 + std**2 / 10)
+        scores[variant, environment] = mean + gap * error + spread
+    plant_scores(tmp_path, {**scores, ("mine", CHEETAH): spread})
+    result = table.compare(table.read_runs(tmp_path), 4).set_index(["environment", "variant"])
+    for (variant, environment), of_seeds in scores.items():
+        row = result.loc[(environment, variant)]
+        mean, std, _ = paper.loc[(environment, variant), ["mean", "std", "runs"]]
+        welch = stats.ttest_ind_from_stats(of_seeds.mean(), of_seeds.std(ddof=1), 10, mean, std, 10, equal_var=False)
+        assert (row["asked"], row["runs"], row["paper_mean"], row["paper_std"]) == (10, 10, mean, std)
+        assert row["mean"] == pytest.approx(of_seeds.mean()) and row["std"] == pytest.approx(of_seeds.std(ddof=1))
+        assert row["difference"] / row["standard_error"] == pytest.approx(welch.statistic)
+        assert row["mark"] == ("higher" if welch.statistic > 2 else "lower" if welch.statistic < -2 else "")
+    assert list(result["mark"]).count("") == 4  # 1.99, 0, 1.99, and the variant that the paper does not have
+    row = result.loc[(CHEETAH, "mine")]
+    assert row["mean"] == pytest.approx(0) and math.isnan(row["paper_mean"]) and row["column"] == "mine"
+    # Tasks and variants in the paper's order, others behind.
+    assert list(dict.fromkeys(result.reset_index()["environment"])) == [CHEETAH, WALKER, FISH]
+    assert [variant for environment, variant in result.index if environment == CHEETAH] == [
+        "aarl_state",
+        "sac_identity",
+        "mine",
+    ]
+
+
+TASKS = [
+    f"dm_control/{task}-v0" for task in ("acrobot-swingup", "fish-swim", "cheetah-run", "dog-run", "hopper-hop", "walker-run")
+]
+
+
+def planted_matrices() -> dict[str, np.ndarray]:
+    """Scores (runs, tasks) of two variants, which rliable was given too."""
+    runs, tasks = np.arange(10)[:, None], np.arange(6)[None]
+    a = 100.0 * tasks + (37 * runs + 11 * tasks * runs) % 101
+    b = 95.0 * tasks + (53 * runs + 7 * tasks * runs) % 89
+    return {"a": a, "b": b[:8]}
+
+
+@pytest.fixture
+def planted(tmp_path: Path) -> pd.DataFrame:
+    matrices = planted_matrices()
+    plant_scores(tmp_path, {(name, task): matrices[name][:, i] for name in matrices for i, task in enumerate(TASKS)})
+    return table.read_runs(tmp_path)
+
+
+def test_interquartile_means_and_their_intervals_are_those_of_rliable(planted: pd.DataFrame) -> None:
+    # rliable 1.2.0 with arch 7.2.0 and pandas 2.3.3: get_interval_estimates, aggregate_iqm, 20000 resamples. Two of its
+    # seeds differ by up to 0.2.
+    of_rliable = {"a": (294.76666667, 284.9, 304.33333333), "b": (279.04166667, 268.5, 288.91770833)}
+    result = table.interquartile_means(planted).set_index("variant")
+    for variant, (iqm, low, high) in of_rliable.items():
+        row = result.loc[variant]
+        assert row["iqm"] == pytest.approx(iqm) == pytest.approx(stats.trim_mean(planted_matrices()[variant].ravel(), 0.25))
+        assert (row["low"], row["high"]) == pytest.approx((low, high), abs=0.5)
+        n_runs = planted_matrices()[variant].size
+        assert (row["tasks"], row["n_tasks"], row["asked"], row["runs"]) == ("DeepMind Control", 6, n_runs, n_runs)
+
+
+def test_probabilities_of_improvement_are_those_of_rliable(planted: pd.DataFrame) -> None:
+    # As above: probability_of_improvement, 5000 resamples; its seeds differ by 0.004.
+    a, b = planted_matrices().values()
+    u = [stats.mannwhitneyu(a[:, i], b[:, i], alternative="greater").statistic / 80 for i in range(6)]
+    result = table.improvements(planted).set_index(["variant", "over"])
+    assert result.loc[("a", "b"), "probability"] == pytest.approx(0.60625) == pytest.approx(np.mean(u))
+    assert tuple(result.loc[("a", "b"), ["low", "high"]]) == pytest.approx((0.49583333, 0.715625), abs=0.01)
+    assert tuple(result.loc[("b", "a"), ["probability", "n_tasks"]]) == pytest.approx((1 - 0.60625, 6))
+    assert len(result) == 2
+
+
+def test_ties_are_half(tmp_path: Path) -> None:
+    plant_scores(tmp_path, {(variant, CHEETAH): np.array([3.0, 3.0]) for variant in ("a", "b")})
+    assert list(table.improvements(table.read_runs(tmp_path))["probability"]) == [0.5, 0.5]
+
+
+def test_statistics_are_over_tasks_of_one_scale_that_all_variants_have(tmp_path: Path) -> None:
+    scores = {
+        ("a", CHEETAH): np.array([1.0, 2.0]),
+        ("b", CHEETAH): np.array([5.0, 9.0]),
+        ("a", WALKER): np.array([999.0, 999.0]),  # the other one has none
+        ("a", "Pendulum-v1"): np.array([-100.0, -200.0]),
+        ("b", "Pendulum-v1"): np.array([-900.0, -100.0]),
+    }
+    plant_scores(tmp_path, scores)
+    runs = table.read_runs(tmp_path)
+    iqm = table.interquartile_means(runs).set_index(["tasks", "variant"])["iqm"]
+    assert iqm.to_dict() == {
+        ("DeepMind Control", "a"): 1.5,
+        ("DeepMind Control", "b"): 7.0,
+        ("Pendulum-v1", "a"): -150.0,
+        ("Pendulum-v1", "b"): -500.0,
+    }
+    better = table.improvements(runs).set_index(["variant", "over"])
+    assert better.loc[("a", "b"), "probability"] == pytest.approx(np.mean([0.0, (0.5 + 1 + 0 + 1) / 4]))
+    assert better.loc[("a", "b"), "n_tasks"] == 2
+
+
+def test_one_run_has_neither_deviation_nor_interval_nor_mark(tmp_path: Path) -> None:
+    plant_scores(tmp_path, {("aarl_state", CHEETAH): np.array([1.0]), ("sac_identity", CHEETAH): np.array([999.0])})
+    runs = table.read_runs(tmp_path)
+    result = table.compare(runs, 4)
+    assert result["std"].isna().all() and list(result["mark"]) == ["", ""] and list(result["mean"]) == [1.0, 999.0]
+    assert table.interquartile_means(runs)[["low", "high"]].isna().all(axis=None)
+    shown = runner.invoke(app, ["table", str(tmp_path)])
+    assert shown.exit_code == 0, shown.stderr
+    assert "│ cheetah-run │          1 │ 472 ± 30 │" in shown.stdout
+
+
+def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
+    returns = {
+        "aarl_state": {CHEETAH: [400.0, 480.0], WALKER: [900.0, 910.0]},
+        "aarl_mlp_1": {CHEETAH: [390.0, 410.0], WALKER: [700.0, 850.0]},
+        "aarl_mlp_4": {CHEETAH: [100.0, 150.0], WALKER: [300.0]},  # a run is missing
+    }
+    plant_scores(tmp_path, {(v, e): np.array(scores) for v, of in returns.items() for e, scores in of.items()})
+    plant(tmp_path, Cell("aarl_mlp_4", WALKER, 1), {}, failed="it burst")
+    result = table.compare(table.read_runs(tmp_path), 6).set_index("variant")
+    complete = ("aarl_state", "aarl_mlp_1")
+    scale = {env: np.mean([returns[variant][env] for variant in complete]) for env in (CHEETAH, WALKER)}
+    relative = {v: np.concatenate([np.array(returns[v][env]) / scale[env] for env in scale]) for v in complete}
+    best = max(scores.mean() for scores in relative.values())
+    for variant, scores in relative.items():
+        row = result.loc[variant]
+        assert (row["mean"], row["std"]) == pytest.approx((scores.mean() / best, scores.std(ddof=1) / best))
+        assert (row["environment"], row["asked"], row["runs"], row["paper_runs"]) == ("normalized", 4, 4, 30)
+    assert result.loc["aarl_state", "mean"] == 1.0 == result.loc["aarl_state", "paper_mean"]
+    assert math.isnan(result.loc["aarl_mlp_4", "mean"]) and result.loc["aarl_mlp_4", "runs"] == 0
+    shown = runner.invoke(app, ["table", str(tmp_path)])
+    assert "1.000 ± 0.129" in shown.stdout and "aarl_mlp_4 on walker-walk, seed 1: it burst" in shown.stdout
+
+
+def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
+    steps = (100_000, 500_000)
+    for seed in range(3):
+        plant(tmp_path, Cell("aarl_state", CHEETAH, seed), {100_000: 470.0 + seed, 500_000: 800.0 + seed}, steps)
+        plant(tmp_path, Cell("sac_identity", CHEETAH, seed), {100_000: 200.0 + seed, 500_000: 300.0 + seed}, steps)
+    plant(tmp_path, Cell("aarl_state", CHEETAH, 3), {}, steps, failed="TrainingError: it burst")
+    plant(tmp_path, Cell("aarl_state", CHEETAH, 4), {100_000: 480.0}, steps)
+    plant(tmp_path, Cell("aarl_state", CHEETAH, 5), {}, steps, sessions=[])
+    plant(tmp_path, Cell("aarl_state", CHEETAH, 6), {}, steps, sessions=[])
+    plant(tmp_path, Cell("aarl_state", CHEETAH, 7), {100_000: math.nan, 500_000: 9.0}, steps)
+    plant(tmp_path, Cell("mine", CHEETAH, 0), {}, steps, sessions=[{"commit": "c0ffee"}, {"commit": "beef"}])
+    result = table.compare(table.read_runs(tmp_path), 4).set_index(["checkpoint", "variant"])
+    early = result.loc[(100_000, "aarl_state")]
+    assert (early["asked"], early["runs"], early["mean"]) == (8, 4, np.mean([470, 471, 472, 480]))
+    assert (result.loc[(100_000, "mine"), "asked"], result.loc[(100_000, "mine"), "runs"]) == (1, 0)
+    shown = runner.invoke(app, ["table", str(tmp_path), "--json", str(tmp_path / "data.json")])
+    assert shown.exit_code == 0, shown.stderr
+    assert "473 ± 5 (4/8)" in shown.stdout
+    lines = [line for line in shown.stdout.splitlines() if line.startswith("Missing")]
+    assert lines == [
+        "Missing at 100,000: aarl_state on cheetah-run, seed 3: TrainingError: it burst",
+        "Missing at 100,000: aarl_state on cheetah-run, seeds 5, 6: not begun",
+        "Missing at 100,000: aarl_state on cheetah-run, seed 7: its return is nan",
+        "Missing at 100,000: mine on cheetah-run, seed 0: unfinished, evaluated up to 0",
+        "Missing at 500,000: aarl_state on cheetah-run, seed 3: TrainingError: it burst",
+        "Missing at 500,000: aarl_state on cheetah-run, seed 4: unfinished, evaluated up to 100,000",
+        "Missing at 500,000: aarl_state on cheetah-run, seeds 5, 6: not begun",
+        "Missing at 500,000: mine on cheetah-run, seed 0: unfinished, evaluated up to 0",
+    ]
+    assert json.loads((tmp_path / "data.json").read_text())["missing"] == lines
+    assert "Runs of several commits: c0ffee (9); c0ffee, beef (1)" in shown.stdout
+    iqm = table.interquartile_means(table.read_runs(tmp_path)).set_index(["checkpoint", "variant"])
+    assert list(iqm.loc[100_000].index) == ["aarl_state", "sac_identity"]  # what has no run hides no others
+    assert tuple(iqm.loc[(100_000, "aarl_state"), ["asked", "runs"]]) == (8, 4) and "│ 4/8" in shown.stdout
+
+
+def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) -> None:
+    plant_scores(
+        tmp_path, {("aarl_state", CHEETAH): np.array([430.0, 440.0]), ("curl_state", CHEETAH): np.array([189.0, 191.0])}
+    )
+    # Its variants first: the others are of no table.
+    options = ["--table", "4", "--csv", str(tmp_path / "scores.csv"), "--json", str(tmp_path / "data.json")]
+    shown = runner.invoke(app, ["table", str(tmp_path), *options])
+    assert shown.exit_code == 0, shown.stderr
+    rows = [[cell.strip() for cell in line.strip("│┃┡┩").split("│")] for line in shown.stdout.splitlines() if "│" in line]
+    (cheetah,) = (row for row in rows if row[0] == "cheetah-run")
+    a, b = (matrix[:, 2] for matrix in planted_matrices().values())
+    own = [f"{scores.mean():.0f} ± {scores.std(ddof=1):.0f}" for scores in (a, b)]
+    assert cheetah[1:] == ["435 ± 7 ▼", "472 ± 30", "190 ± 1", "190 ± 32", *own]
+    assert shown.stdout.index("AARL-State") < shown.stdout.index("CURL")
+    assert "Paper: table 4." in shown.stdout and "[" not in shown.stdout.partition("Interquartile")[0]
+    runs = table.read_runs(tmp_path)
+    comparison = table.compare(runs, 4)
+    written = pd.read_csv(tmp_path / "scores.csv", keep_default_na=True)
+    pd.testing.assert_frame_equal(written.fillna({"mark": ""}), comparison, check_dtype=False)
+    data = json.loads((tmp_path / "data.json").read_text())
+    assert data["table"] == 4 and data["missing"] == [] and data["commits"] == {"c0ffee": len(runs)}
+    frames = (("scores", comparison), ("improvements", table.improvements(runs)), ("runs", runs))
+    for name, frame in frames:
+        as_frame = pd.DataFrame(data[name], columns=list(frame.columns))
+        pd.testing.assert_frame_equal(as_frame.astype(frame.dtypes.to_dict()), frame, check_exact=False)
+
+
+def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
+    result = runner.invoke(app, ["table", str(tmp_path)])
+    assert result.exit_code == 2 and result.stderr == f"Error: {tmp_path} has no runs of a benchmark\n"
