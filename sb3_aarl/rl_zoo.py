@@ -1,0 +1,109 @@
+"""
+RL-Zoo's own programs with SACAux, as ``sac_aux``, and with DeepMind Control as SACAux needs it.
+
+    python -m sb3_aarl.rl_zoo train --algo sac_aux --env dm_control/cheetah-run-v0 -conf zoo_configs/aarl_state.yml
+    python -m sb3_aarl.rl_zoo enjoy --algo sac_aux --env dm_control/cheetah-run-v0 -f logs
+    python -m sb3_aarl.rl_zoo record_video --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
+    python -m sb3_aarl.rl_zoo plot_train -a sac_aux -e dm_control/cheetah-run-v0 -f logs
+
+Everything after the program's name is RL-Zoo's: see ``python -m sb3_aarl.rl_zoo train --help``.
+"""
+
+import argparse
+import functools
+import importlib
+import runpy
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import yaml
+
+from sb3_aarl.envs import env_ids, make_dmc_env  # first: it chooses the renderer
+from sb3_aarl.sac_aux import SACAux
+
+# Each is a function of its own name in one of RL-Zoo's modules; record_video is a script.
+PROGRAMS = {"train": "rl_zoo3.train", "enjoy": "rl_zoo3.enjoy", "record_video": "", "plot_train": "rl_zoo3.plots"}
+
+
+def register() -> None:
+    """
+    Make SACAux known to RL-Zoo as ``sac_aux``, and have it make DeepMind Control's tasks with ``make_dmc_env``.
+
+    Their ``env_kwargs`` are then those of ``make_dmc_env``, as for ``aarl``; ``gymnasium.make`` stays what it is. Other
+    environments are made as RL-Zoo makes them; the key ``env_wrapper`` can name ``sb3_aarl.envs.wrap_env`` for them.
+
+    :raises ModuleNotFoundError: without RL-Zoo
+    """
+    from rl_zoo3 import ALGOS  # type: ignore[import-not-found]
+
+    # The one dictionary that all of RL-Zoo's modules have imported.
+    ALGOS["sac_aux"] = SACAux
+    for env_id in env_ids():
+        # RL-Zoo makes environments with this method of their specification.
+        gym.registry[env_id].make = functools.partial(_make_env, env_id)  # type: ignore[method-assign]
+
+
+def _make_env(env_id: str, render_mode: str | None = None, **env_kwargs: Any) -> gym.Env:
+    """``make_dmc_env`` for RL-Zoo, whose ``render_mode`` it does not need: SB3 shows arrays in a window where asked to."""
+    return make_dmc_env(env_id, **env_kwargs)
+
+
+def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
+    """
+    Arguments of ``train`` with the ``env_kwargs`` of its file of hyper-parameters as ``--env-kwargs``.
+
+    RL-Zoo gives those of the file to the environment of the training only. Those of the command line are noted with the
+    model and also reach evaluations, ``enjoy`` and ``record_video``. What is there already wins.
+
+    :param arguments: RL-Zoo's arguments; the program ends with an error where ``sac_aux`` has no file, or no readable one
+    """
+    parser = argparse.ArgumentParser(prog="python -m sb3_aarl.rl_zoo train", add_help=False)
+    parser.add_argument("--algo")
+    parser.add_argument("--env")
+    parser.add_argument("-conf", "--conf-file")
+    parser.add_argument("--env-kwargs", nargs="+", default=[])
+    known, _ = parser.parse_known_args(arguments)
+    path = known.conf_file
+    if path is None and known.algo == "sac_aux":
+        parser.error("RL-Zoo has no hyper-parameters for sac_aux: name a file with -conf, such as zoo_configs/aarl_state.yml")
+    if path is None or not path.endswith((".yml", ".yaml")):
+        return list(arguments)
+    try:
+        with open(path, encoding="utf-8") as file:
+            entries = yaml.safe_load(file)
+        env_kwargs = entries.get(known.env, entries.get("default", {})).get("env_kwargs", {})
+        values = [f"{key}:{value!r}" for key, value in env_kwargs.items()]
+    except (OSError, yaml.YAMLError, AttributeError) as error:
+        parser.error(f"{path} is no file of hyper-parameters: {error}")
+    return [*arguments, "--env-kwargs", *values, *known.env_kwargs] if values else list(arguments)
+
+
+def main() -> None:
+    """Run one of RL-Zoo's programs with the arguments of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_aarl.rl_zoo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("program", choices=PROGRAMS)
+    program = parser.parse_args(sys.argv[1:2]).program
+    arguments = sys.argv[2:]
+    if program == "train":
+        arguments = with_env_kwargs(arguments)
+    elif program == "plot_train":
+        # It looks for folders, in whose names RL-Zoo has a dash for the slash.
+        arguments = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
+    sys.argv = [f"{parser.prog} {program}", *arguments]
+    try:
+        register()
+        run = getattr(importlib.import_module(PROGRAMS[program]), program) if PROGRAMS[program] else None
+    except ModuleNotFoundError as error:
+        parser.error(f"{error}: pip install 'sb3-aarl[zoo]'")
+    if run is None:
+        runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
+    else:
+        run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""RL-Zoo's own programs: train, enjoy, record_video and plot_train with SACAux and our files of hyper-parameters."""
+
+import os
+import subprocess
+import sys
+from ast import literal_eval
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stable_baselines3.common.monitor import load_results
+
+from sb3_aarl import SACAux, catalog
+from sb3_aarl.encoders import DenseMLP
+from sb3_aarl.envs import make_dmc_env
+from sb3_aarl.rl_zoo import with_env_kwargs
+
+ZOO = Path(__file__).parent.parent / "zoo_configs"
+TASK = "dm_control/cheetah-run-v0"
+SAC_AUX = ["--algo", "sac_aux", "--env", TASK]
+
+
+def run(folder: Path, *command: str) -> str:
+    """What a Python process prints."""
+    done = subprocess.run(
+        [sys.executable, *command],
+        cwd=folder,
+        env={**os.environ, "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder where RL-Zoo trained for 280 agent steps, 20 of them with gradient steps, and evaluated once."""
+    pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
+    folder = tmp_path_factory.mktemp("zoo")
+    small = ["-params", "learning_starts:260", "batch_size:8", "buffer_size:500"]
+    settings = ["-n", "280", "--eval-freq", "270", "--eval-episodes", "1", "--device", "cpu", "--seed", "3", *small]
+    run(folder, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "aarl_state.yml"), *settings)
+    return folder / "logs/sac_aux/dm_control-cheetah-run-v0_1"
+
+
+def test_trains_with_the_hyperparameters_of_the_file(trained: Path) -> None:
+    model = SACAux.load(trained / "dm_control-cheetah-run-v0.zip", device="cpu")
+    assert type(model) is SACAux and model.num_timesteps == 280 and model._n_updates == 20
+    assert (model.batch_size, model.buffer_size, model.learning_starts, model.seed) == (8, 500, 260, 3)
+    # Table 8.
+    assert model.lr_schedule(1) == 2e-4  # Cheetah-Run's own
+    assert (model.tau, model.encoder_tau, model.gamma, model.target_update_interval) == (0.01, 0.05, 0.99, 2)
+    assert (model.ent_coef, model.ent_coef_learning_rate, list(model.ent_coef_betas)) == ("auto_0.1", 1e-4, [0.5, 0.999])
+    assert model.aux_loss == catalog.load("aarl-state") and model.predictor_width == 256
+    assert model.policy_kwargs["net_arch"] == [1024, 1024]
+    assert type(model.critic.features_extractor) is DenseMLP and model.critic.features_extractor.features_dim == 40
+    # The action repeat of 4 in training and evaluation.
+    assert list(load_results(str(trained)).l) == [250]
+    assert np.load(trained / "evaluations.npz")["ep_lengths"].tolist() == [[250]]
+
+
+def test_enjoy_record_video_and_plot_train(trained: Path) -> None:
+    folder = trained.parents[2]
+    programs = [
+        ["enjoy", *SAC_AUX, "-f", "logs", "-n", "260", "--no-render", "--device", "cpu", "--seed", "5"],
+        ["record_video", *SAC_AUX, "-f", "logs", "-n", "3", "-o", "videos"],
+        ["plot_train", "-a", "sac_aux", "-e", TASK, "-f", "logs", "-w", "1"],
+    ]
+    # In one process, as importing takes longer than all they do.
+    lines = ["import sys", "from matplotlib import pyplot as plt", "from sb3_aarl.rl_zoo import main"]
+    lines += [f"sys.argv = {['', *program]}\nmain()" for program in programs]
+    printed = run(folder, "-c", "\n".join([*lines, "print([len(line.get_xdata()) for line in plt.gca().lines])"]))
+
+    model = SACAux.load(trained / "dm_control-cheetah-run-v0.zip", device="cpu")
+    env = make_dmc_env(TASK, action_repeat=4)
+    observation, _ = env.reset(seed=5)
+    episode_reward = 0.0
+    for _ in range(250):
+        action, _ = model.predict(observation, deterministic=True)
+        observation, reward, _, truncated, _ = env.step(action)
+        episode_reward += float(reward)
+    assert truncated
+    assert f"Episode Reward: {episode_reward:.2f}\nEpisode Length 250\n" in printed
+    assert [path.suffix for path in (folder / "videos").iterdir()] == [".mp4"]
+    assert printed.endswith("[1]\n")  # one curve, of one episode
+
+
+def added(arguments: list[str]) -> dict[str, object]:
+    """What is behind the last --env-kwargs, as RL-Zoo reads it: values are Python, the last of a key counts."""
+    values = arguments[len(arguments) - arguments[::-1].index("--env-kwargs") :]
+    return {key: literal_eval(value) for key, _, value in (item.partition(":") for item in values)}
+
+
+def test_environment_arguments_of_the_file() -> None:
+    walker = ["--algo", "sac_aux", "--env", "dm_control/walker-walk-v0", "-conf", str(ZOO / "aarl_pixel.yml")]
+    pixels = {"pixels": True, "image_size": 100, "frame_stack": 3, "action_repeat": 2}
+    arguments = with_env_kwargs([*walker, "-n", "5"])
+    assert arguments[:8] == [*walker, "-n", "5"] and added(arguments) == pixels
+    # Given ones win; what is in no entry is the default's.
+    arguments = with_env_kwargs(["--env-kwargs", "image_size:84", "fast_rendering:True", *walker])
+    assert added(arguments) == {**pixels, "image_size": 84, "fast_rendering": True}
+    other = [*walker[:3], "dm_control/fish-swim-v0", "--conf-file", walker[5]]
+    assert added(with_env_kwargs(other)) == {**pixels, "action_repeat": 4}
+
+
+@pytest.mark.parametrize("arguments", [["--algo", "ppo"], ["--algo", "sac_aux", "-conf", "my.module"], ["--help"]])
+def test_what_is_not_ours_stays(arguments: list[str]) -> None:
+    assert with_env_kwargs(arguments) == arguments
+
+
+def test_one_error_for_a_file_that_is_missing_or_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "list.yml").write_text("[1, 2]")
+    (tmp_path / "torn.yml").write_text("{a: b")
+    (tmp_path / "object.yml").write_text("!!python/object/apply:os.getcwd []")
+    for name in ("no.yml", "list.yml", "torn.yml", "object.yml"):
+        with pytest.raises(SystemExit):
+            with_env_kwargs([*SAC_AUX, "-conf", str(tmp_path / name)])
+        assert f"error: {tmp_path / name} is no file of hyper-parameters" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        with_env_kwargs(SAC_AUX)
+    assert "zoo_configs/aarl_state.yml" in capsys.readouterr().err
