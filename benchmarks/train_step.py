@@ -96,6 +96,17 @@ def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
     return SACAux(policy, RandomEnv(setting, 100), batch_size=BATCH[setting], buffer_size=2000, device=device, **kwargs)
 
 
+def modes(device: str) -> dict[str, dict[str, Any]]:
+    """The ways to run a gradient step on this device, by name."""
+    ways: dict[str, dict[str, Any]] = {"fp32": {}, "bf16": {"precision": "bf16"}}
+    if device == "cuda":
+        ways |= {"tf32": {"allow_tf32": True}}
+        ways |= {f"{name}, graphs": {**kwargs, "compile": "cudagraphs"} for name, kwargs in ways.items()}
+        on_gpu = {"replay_buffer_kwargs": {"storage_device": "cuda"}}
+        ways |= {f"{name}, storage": {**ways[name], **on_gpu} for name in ("tf32, graphs", "bf16, graphs")}
+    return ways
+
+
 def synchronize(device: str) -> None:
     if device == "cuda":
         th.cuda.synchronize()
@@ -227,11 +238,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
-    variants: dict[str, dict[str, Any]] = {
-        "no auxiliary loss": {"aux_loss": None},
-        "fp32": {},
-        "bf16": {"precision": "bf16"},
-    }
+    variants: dict[str, dict[str, Any]] = {"no auxiliary loss": {"aux_loss": None}, **modes(args.device)}
     rows = []
     for setting in args.settings:
         steps = args.steps or (200 if args.device == "cuda" else {"state": 6, "pixels": 2}[setting])
