@@ -1,5 +1,5 @@
 """
-Many trainings on one machine at once: gradient steps a second of 1, 2, 4, ... processes, and what that makes of a whole search.
+Many trainings on one machine at once: gradient steps a second of 1, 2, 4, ... processes, and the hours of a whole search.
 
 Every process trains a model of its own, as ``train_step.py`` makes it, on random data for some seconds, all at the same time.
 From the total follow the hours that the gradient steps of a search take (the paper's: about 700 candidates, 500,000
