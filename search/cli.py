@@ -361,14 +361,16 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
 
     runs = tables.read_runs(folder)
     number = tables.closest_table(runs["variant"]) if number is None else number
+    runs = tables.in_order(runs, number)
     comparison = tables.compare(runs, number)
     iqm, better = tables.interquartile_means(runs), tables.improvements(runs)
     if csv is not None:
         comparison.to_csv(csv, index=False)
     if json is not None:
         json.write_text(dumps(tables.as_data(number, comparison, iqm, better, runs), indent=1) + "\n", encoding="utf-8")
+    wide = Console(width=1000)  # as wide as a table is: cut numbers are wrong ones
     for shown in [*tables.score_tables(comparison), *tables.statistics_tables(iqm, better)]:
-        console.print(shown)
+        wide.print(shown)
     if number is not None:
         console.print(
             f"Paper: table {number}. ▲ ▼: the difference from it is more than two standard errors of the difference, "

@@ -82,25 +82,52 @@ def read_runs(folder: Path) -> pd.DataFrame:
     """
     rows = []
     for path in sorted(folder.glob(f"*/*/*/{ABOUT}")):
-        about = json.loads(path.read_text(encoding="utf-8"))
-        curve = path.with_name("curve.csv")
-        points = {point.environment_steps: point.mean for point in read_curve(curve)} if curve.exists() else {}
-        commits = ", ".join(dict.fromkeys(session["commit"] for session in about["sessions"]))
-        for checkpoint in about["checkpoints"]:
-            mean = points.get(checkpoint, math.nan)
-            if math.isfinite(mean):
-                reason = ""
-            elif checkpoint in points:
-                reason = f"its return is {mean}"
-            else:
-                begun = f"unfinished, evaluated up to {max(points, default=0):,}" if about["sessions"] else "not begun"
-                reason = about.get("failed", begun)
-            run = (about["variant"], about["environment"], about["seed"])
-            rows.append((*run, checkpoint, math.nan if reason else mean, reason, commits))
+        try:
+            rows += _points(path)
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path.parent} is not what a benchmark leaves: {type(error).__name__}: {error}") from None
     if not rows:
         raise ValueError(f"{folder} has no runs of a benchmark")
     columns = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit"]
     return pd.DataFrame(rows, columns=columns)
+
+
+def _points(path: Path) -> list[tuple[Any, ...]]:
+    """The rows of one run."""
+    about = json.loads(path.read_text(encoding="utf-8"))
+    curve = path.with_name("curve.csv")
+    points = {point.environment_steps: point.mean for point in read_curve(curve)} if curve.exists() else {}
+    commits = ", ".join(dict.fromkeys(session["commit"] for session in about["sessions"]))
+    rows = []
+    for checkpoint in about["checkpoints"]:
+        mean = points.get(checkpoint, math.nan)
+        if math.isfinite(mean):
+            reason = ""
+        elif checkpoint in points:
+            reason = f"its return is {mean}"
+        else:
+            begun = f"unfinished, evaluated up to {max(points, default=0):,}" if about["sessions"] else "not begun"
+            reason = about.get("failed", begun)
+        run = (about["variant"], about["environment"], about["seed"])
+        rows.append((*run, checkpoint, math.nan if reason else mean, reason, commits))
+    return rows
+
+
+def in_order(runs: pd.DataFrame, number: int | None) -> pd.DataFrame:
+    """
+    The runs in the order of a table of the paper, its tasks and variants before others.
+
+    :param runs: As :func:`read_runs` gives them
+    :param number: 3, 4 or 6, None for the alphabet's order
+    """
+    places = {}
+    for key in ("environment", "variant"):
+        of_paper = paper_scores(number)[key].dropna().tolist() if number is not None else []
+        names = dict.fromkeys(of_paper + sorted(runs[key]))
+        places[key] = {name: place for place, name in enumerate(names)}
+    keys = ["checkpoint", "environment", "variant", "seed"]
+    by_place = runs.sort_values(keys, key=lambda column: column.map(places.get(str(column.name), lambda value: value)))
+    return by_place.reset_index(drop=True)
 
 
 def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
@@ -117,8 +144,8 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
 
     :param runs: As :func:`read_runs` gives them
     :param number: 3, 4 or 6, None for no table of the paper
-    :return: One row for each ``checkpoint``, ``environment`` and ``variant``, in the paper's order: ``asked`` and ``runs``
-        (how many were asked for, and are there), ``mean``, ``std``, ``column`` (the paper's heading), ``paper_mean``,
+    :return: One row for each ``checkpoint``, ``environment`` and ``variant``, in their order: ``asked`` and ``runs`` (how
+        many were asked for, and are there), ``mean``, ``std``, ``column`` (the paper's heading), ``paper_mean``,
         ``paper_std``, ``paper_runs``, ``difference``, ``standard_error`` and ``mark`` (``higher``, ``lower`` or empty)
     """
     keys = ["checkpoint", "environment", "variant"]
@@ -126,10 +153,10 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     columns = [*keys, "column", "paper_mean", "paper_std", "paper_runs"]
     if number is None:
         paper = pd.DataFrame(columns=columns)
-        tasks, names = [], {}
+        names = {}
     else:
         paper = paper_scores(number).rename(columns={name: f"paper_{name}" for name in ("mean", "std", "runs")})
-        tasks, names = list(dict.fromkeys(paper["environment"])), dict(zip(paper["variant"], paper["column"], strict=True))
+        names = dict(zip(paper["variant"], paper["column"], strict=True))
     numbers = dict.fromkeys(columns[-3:], float)
     result = result.merge(paper.drop(columns="column").astype(numbers), on=keys, how="left")
     result["column"] = [names.get(variant, variant) for variant in result["variant"]]
@@ -138,21 +165,11 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     result["standard_error"] = np.sqrt(variance)
     far = result["difference"].abs() > STANDARD_ERRORS * result["standard_error"]
     result["mark"] = np.where(far, np.where(result["difference"] > 0, "higher", "lower"), "")
-    order = {
-        "environment": [*tasks, *(name for name in dict.fromkeys(runs["environment"]) if name not in tasks)],
-        "variant": [*names, *(name for name in dict.fromkeys(runs["variant"]) if name not in names)],
-    }
-    places = {key: {name: place for place, name in enumerate(values)} for key, values in order.items()}
-    result = result.sort_values(
-        keys, key=lambda column: column.map(places[str(column.name)]) if column.name in places else column
-    )
-    return result[[*keys, "asked", "runs", "mean", "std", *columns[3:], "difference", "standard_error", "mark"]].reset_index(
-        drop=True
-    )
+    return result[[*keys, "asked", "runs", "mean", "std", *columns[3:], "difference", "standard_error", "mark"]]
 
 
 def _by_task(runs: pd.DataFrame) -> pd.DataFrame:
-    grouped = runs.groupby(["checkpoint", "environment", "variant"])["mean"]
+    grouped = runs.groupby(["checkpoint", "environment", "variant"], sort=False)["mean"]
     summary = {"asked": grouped.size(), "runs": grouped.count(), "mean": grouped.mean(), "std": grouped.std(ddof=1)}
     return pd.DataFrame(summary).reset_index()
 
@@ -161,10 +178,12 @@ def _normalized(runs: pd.DataFrame) -> pd.DataFrame:
     """Each variant's mean over all environments; only variants that have all runs can be normalized together."""
     parts = []
     for checkpoint, all_of in runs.groupby("checkpoint"):
-        asked = all_of.groupby("variant").size().rename("asked")
-        there = comparable(all_of.dropna(subset="mean")).rename(columns={"mean": "last"})
-        table = operator_selection.table(there).reindex(asked.index).assign(asked=asked, checkpoint=checkpoint)
-        table["runs"] = table["runs"].fillna(0).astype(int)
+        there = all_of.groupby("variant", sort=False)["mean"].count()
+        complete = comparable(all_of.dropna(subset="mean")).rename(columns={"mean": "last"})
+        n_asked = len(all_of[["environment", "seed"]].drop_duplicates())
+        table = (
+            operator_selection.table(complete).reindex(there.index).assign(runs=there, asked=n_asked, checkpoint=checkpoint)
+        )
         # It gives the deviation of the population.
         table["std"] *= np.sqrt(table["runs"] / (table["runs"] - 1).where(table["runs"] > 1))
         parts.append(table.reset_index().assign(environment=NORMALIZED))

@@ -70,7 +70,8 @@ normalized | 0.919 ± 0.217 | 0.544 ± 0.360 | 1.000 ± 0.129 | 0.813 ± 0.218
 """,
 }
 CHEETAH, WALKER, FISH = (f"dm_control/{task}-v0" for task in ("cheetah-run", "walker-walk", "fish-upright"))
-runner = CliRunner(env={"COLUMNS": "250", "TERM": "dumb"})
+# A narrow terminal must not cut numbers.
+runner = CliRunner(env={"COLUMNS": "60", "TERM": "dumb"})
 
 
 def environment_id(task: str) -> str:
@@ -149,7 +150,7 @@ def test_means_deviations_and_marks(tmp_path: Path) -> None:
         error = math.sqrt(spread.var(ddof=1) / 10 + std**2 / 10)
         scores[variant, environment] = mean + gap * error + spread
     plant_scores(tmp_path, {**scores, ("mine", CHEETAH): spread})
-    result = table.compare(table.read_runs(tmp_path), 4).set_index(["environment", "variant"])
+    result = table.compare(table.in_order(table.read_runs(tmp_path), 4), 4).set_index(["environment", "variant"])
     for (variant, environment), of_seeds in scores.items():
         row = result.loc[(environment, variant)]
         mean, std, _ = paper.loc[(environment, variant), ["mean", "std", "runs"]]
@@ -270,7 +271,7 @@ def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
         assert (row["mean"], row["std"]) == pytest.approx((scores.mean() / best, scores.std(ddof=1) / best))
         assert (row["environment"], row["asked"], row["runs"], row["paper_runs"]) == ("normalized", 4, 4, 30)
     assert result.loc["aarl_state", "mean"] == 1.0 == result.loc["aarl_state", "paper_mean"]
-    assert math.isnan(result.loc["aarl_mlp_4", "mean"]) and result.loc["aarl_mlp_4", "runs"] == 0
+    assert math.isnan(result.loc["aarl_mlp_4", "mean"]) and tuple(result.loc["aarl_mlp_4", ["asked", "runs"]]) == (4, 3)
     shown = runner.invoke(app, ["table", str(tmp_path)])
     assert "1.000 ± 0.129" in shown.stdout and "aarl_mlp_4 on walker-walk, seed 1: it burst" in shown.stdout
 
@@ -286,7 +287,7 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
     plant(tmp_path, Cell("aarl_state", CHEETAH, 6), {}, steps, sessions=[])
     plant(tmp_path, Cell("aarl_state", CHEETAH, 7), {100_000: math.nan, 500_000: 9.0}, steps)
     plant(tmp_path, Cell("mine", CHEETAH, 0), {}, steps, sessions=[{"commit": "c0ffee"}, {"commit": "beef"}])
-    result = table.compare(table.read_runs(tmp_path), 4).set_index(["checkpoint", "variant"])
+    result = table.compare(table.in_order(table.read_runs(tmp_path), 4), 4).set_index(["checkpoint", "variant"])
     early = result.loc[(100_000, "aarl_state")]
     assert (early["asked"], early["runs"], early["mean"]) == (8, 4, np.mean([470, 471, 472, 480]))
     assert (result.loc[(100_000, "mine"), "asked"], result.loc[(100_000, "mine"), "runs"]) == (1, 0)
@@ -326,7 +327,7 @@ def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) 
     assert cheetah[1:] == ["435 ± 7 ▼", "472 ± 30", "190 ± 1", "190 ± 32", *own]
     assert shown.stdout.index("AARL-State") < shown.stdout.index("CURL")
     assert "Paper: table 4." in shown.stdout and "[" not in shown.stdout.partition("Interquartile")[0]
-    runs = table.read_runs(tmp_path)
+    runs = table.in_order(table.read_runs(tmp_path), 4)
     comparison = table.compare(runs, 4)
     written = pd.read_csv(tmp_path / "scores.csv", keep_default_na=True)
     pd.testing.assert_frame_equal(written.fillna({"mark": ""}), comparison, check_dtype=False)
@@ -341,3 +342,12 @@ def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) 
 def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
     result = runner.invoke(app, ["table", str(tmp_path)])
     assert result.exit_code == 2 and result.stderr == f"Error: {tmp_path} has no runs of a benchmark\n"
+
+
+@pytest.mark.parametrize(("file", "content"), [(ABOUT, "{"), (ABOUT, "{}"), ("curve.csv", "steps\n1\n")], ids=str)
+def test_a_file_that_is_not_a_benchmarks_is_named(tmp_path: Path, file: str, content: str) -> None:
+    plant(tmp_path, Cell("mine", CHEETAH, 0), {100_000: 1.0})
+    path = run_folder(tmp_path, Cell("mine", CHEETAH, 0))
+    (path / file).write_text(content)
+    result = runner.invoke(app, ["table", str(tmp_path)])
+    assert result.exit_code == 2 and f"Error: {path} is not what a benchmark leaves" in result.stderr
