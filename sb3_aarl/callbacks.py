@@ -46,8 +46,9 @@ class SingleEpisodes(gym.Wrapper):
     """
     One episode for each ``reset(seed=...)``, and nothing is simulated after it.
 
-    SB3's vectorized environments reset an environment as soon as its episode ends, and step it until all others have ended
-    theirs. Here that costs nothing: until the next seed, the environment stays at its last observation.
+    For ``LearningCurveCallback``, which seeds every episode. SB3's vectorized environments reset an environment as soon as
+    its episode ends, and step it until all others have ended theirs. Here that costs nothing: until the next seed, the
+    environment stays at its last observation.
 
     :param env: The environment, ``Monitor`` included
     """
