@@ -371,7 +371,7 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
     wide = Console(width=1000)  # as wide as a table is: cut numbers are wrong ones
     for shown in [*tables.score_tables(comparison), *tables.statistics_tables(iqm, better)]:
         wide.print(shown)
-    if number is not None:
+    if comparison["paper_mean"].notna().any():
         console.print(
             f"Paper: table {number}. ▲ ▼: the difference from it is more than two standard errors of the difference, "
             "2 sqrt(s²/n + S²/N).",
