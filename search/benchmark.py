@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import optuna
-import torch as th
+import pandas as pd
 
 from sb3_aarl import catalog
+from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search.config import ConfigError, load_hyperparameters, named_environments, resolve_env_id
 from search.grid import Cell, check_training
-from search.objective import CandidateFailed, mean_curve
+from search.objective import end_noted, mean_curve
 from search.provenance import provenance
 from search.storage import open_storage
-from search.training import TrainingError, train_candidate
+from search.training import train_candidate
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
@@ -111,7 +112,7 @@ class Benchmark:
         # A run that was killed and goes on has several.
         about["sessions"] = [*_read_about(path).get("sessions", ()), provenance()]
         _write_about(path, about)
-        try:
+        with end_noted(trial):
             run = train_candidate(
                 cell.environment,
                 loss if loss in (None, "auto") else catalog.resolve(loss),
@@ -121,13 +122,6 @@ class Benchmark:
                 self.evaluation_episodes,
                 path,
             )
-        except KeyboardInterrupt:
-            trial.set_user_attr("interrupted", True)
-            raise
-        except (TrainingError, MemoryError, th.cuda.OutOfMemoryError) as error:
-            reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
-            trial.set_user_attr("reason", reason)
-            raise CandidateFailed(reason) from error
         trial.set_user_attr("curve", mean_curve([run.curve]))
         _write_about(path, {**about, "seconds": run.curve[-1].seconds})
         return run.aulc
@@ -212,6 +206,30 @@ def task_name(environment: str) -> str:
     :param environment: Id of the environment
     """
     return environment.removeprefix(PREFIX).removesuffix("-v0") if environment.startswith(PREFIX) else environment
+
+
+def read_curves(folder: Path) -> pd.DataFrame:
+    """
+    The learning curves of a benchmark's runs, as ``plots.learning_curves_plot`` takes them: one row an evaluation with
+    ``variant``, ``env`` (short form), ``seed``, ``environment_steps``, ``mean`` and ``std`` (of the episodes' returns). Runs
+    that have no evaluation yet are passed over.
+
+    :param folder: Folder of a benchmark
+    :raises ValueError: when no run has a learning curve, or naming one that cannot be read
+    """
+    rows = []
+    for path in sorted(folder.glob(f"*/*/*/{ABOUT}")):
+        curve = path.with_name("curve.csv")
+        if curve.exists():
+            try:
+                about = _read_about(path.parent)
+                run = (about["variant"], task_name(about["environment"]), about["seed"])
+                rows += [(*run, point.environment_steps, point.mean, point.std) for point in read_curve(curve)]
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(f"{path.parent} is not what a benchmark leaves: {type(error).__name__}: {error}") from None
+    if not rows:
+        raise ValueError(f"{folder} has no learning curves of a benchmark")
+    return pd.DataFrame(rows, columns=["variant", "env", "seed", "environment_steps", "mean", "std"])
 
 
 def note_failures(folder: Path, failures: Mapping[Cell, str]) -> None:

@@ -11,11 +11,12 @@ import numpy as np
 import optuna
 import torch as th
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
+from stable_baselines3.common.utils import get_device
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation
 from search.config import SearchConfig
-from search.provenance import commit
+from search.provenance import commit, cpu
 from search.space import suggest_aux_loss
 from search.storage import study_id
 from search.training import TrainingError, train_candidate
@@ -33,9 +34,9 @@ class Objective:
     seeds it is the curve of the first one that is reported: trials are compared like with like, and a pruned one is
     spared its other seeds.
 
-    User attributes of a trial: ``loss`` (notation), ``canonical``, ``environment``, ``commit``; ``curve`` (a list of
-    [environment steps, mean, standard deviation] over the episodes of all seeds) and ``seconds`` of training when it
-    ends; ``reason`` when it fails; ``interrupted`` when Ctrl-C stopped it.
+    User attributes of a trial: ``loss`` (notation), ``canonical``, ``environment``, ``commit``, ``device`` (name of the GPU
+    or the processor), ``threads``; ``curve`` (a list of [environment steps, mean, standard deviation] over the episodes
+    of all seeds) and ``seconds`` of training when it ends; ``reason`` when it fails; ``interrupted`` when Ctrl-C stopped it.
 
     ``study.optimize(objective, catch=CandidateFailed)`` goes on after a candidate that failed.
 
@@ -56,7 +57,7 @@ class Objective:
         :raises optuna.TrialPruned: for an invalid candidate, before anything is trained, and for a pruned one
         :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
         """
-        with _interruptions_noted(trial):
+        with end_noted(trial):
             loss = suggest_aux_loss(trial, self.config.max_horizon, self.config.operators)
             return self._train(trial, loss, self.config.environment, self.config.seeds, {}, None)
 
@@ -83,7 +84,7 @@ class Objective:
         :raises optuna.TrialPruned: when the pruner says so
         :raises CandidateFailed: as above
         """
-        with _interruptions_noted(trial):
+        with end_noted(trial):
             return self._train(trial, aux_loss, environment, seeds, overrides or {}, name)
 
     def _train(
@@ -104,6 +105,8 @@ class Objective:
             "canonical": "none" if aux_loss is None else str(aux_loss.canonical()),
             "environment": environment,
             "commit": self.commit,
+            "device": device_name(hyperparameters.get("device", "auto")),
+            "threads": th.get_num_threads(),
         }
         for key, value in attributes.items():
             trial.set_user_attr(key, value)
@@ -120,26 +123,21 @@ class Objective:
             return not pruned
 
         scores = []
-        try:
-            for seed in seeds:
-                run = train_candidate(
-                    environment,
-                    aux_loss,
-                    hyperparameters,
-                    seed,
-                    checkpoints,
-                    config.evaluation_episodes,
-                    folder / f"seed-{seed}",
-                    on_evaluation=report,
-                )
-                curves.append(run.curve)
-                scores.append(run.aulc)
-                if pruned:
-                    break
-        except (TrainingError, MemoryError, th.cuda.OutOfMemoryError) as error:
-            reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
-            trial.set_user_attr("reason", reason)
-            raise CandidateFailed(reason) from error
+        for seed in seeds:
+            run = train_candidate(
+                environment,
+                aux_loss,
+                hyperparameters,
+                seed,
+                checkpoints,
+                config.evaluation_episodes,
+                folder / f"seed-{seed}",
+                on_evaluation=report,
+            )
+            curves.append(run.curve)
+            scores.append(run.aulc)
+            if pruned:
+                break
         trial.set_user_attr("curve", mean_curve(curves))
         trial.set_user_attr("seconds", round(sum(curve[-1].seconds for curve in curves), 1))
         if pruned:
@@ -148,13 +146,34 @@ class Objective:
 
 
 @contextlib.contextmanager
-def _interruptions_noted(trial: optuna.Trial) -> Iterator[None]:
-    """Ctrl-C is not the candidate's fault, whenever it comes: the sampler gives the same one out again."""
+def end_noted(trial: optuna.Trial) -> Iterator[None]:
+    """
+    Note why a training ended before its time, as the user attribute ``interrupted`` or ``reason``.
+
+    Ctrl-C is not the candidate's fault, whenever it comes: the sampler gives the same one out again.
+
+    :param trial: The training's trial
+    :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
+    """
     try:
         yield
     except KeyboardInterrupt:
         trial.set_user_attr("interrupted", True)
         raise
+    except (TrainingError, MemoryError, th.cuda.OutOfMemoryError) as error:
+        reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
+        trial.set_user_attr("reason", reason)
+        raise CandidateFailed(reason) from error
+
+
+def device_name(device: str) -> str:
+    """
+    What trains: ``GPU: `` and its name, or ``CPU: ``, the processor's name and how many of its cores may be used.
+
+    :param device: As SB3 takes it
+    """
+    trains_on = get_device(device)
+    return f"GPU: {th.cuda.get_device_name(trains_on)}" if trains_on.type == "cuda" else f"CPU: {cpu()}"
 
 
 def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
