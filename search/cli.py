@@ -17,7 +17,10 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
+    from optuna import Study
 
+    from sb3_aarl import AuxLoss
     from search.evolve import Progress
     from search.grid import Cell, Runs
 
@@ -25,6 +28,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
 
+YAML = (".yml", ".yaml")
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 
 
@@ -377,12 +381,19 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
             "2 sqrt(s²/n + S²/N).",
             highlight=False,
         )
-    for line in tables.missing(runs):
-        console.print(line, style="red", markup=False, soft_wrap=True, highlight=False)
+    _show_missing(runs)
     commits = tables.commits(runs)
     if len(commits) > 1:
         of_each = "; ".join(f"{commit} ({count})" for commit, count in commits.items())
         console.print(f"Runs of several commits: {of_each}", style="red", markup=False, soft_wrap=True, highlight=False)
+
+
+def _show_missing(runs: "pd.DataFrame") -> None:
+    """What a benchmark was asked for and does not have."""
+    from search import table as tables
+
+    for line in tables.missing(runs):
+        console.print(line, style="red", markup=False, soft_wrap=True, highlight=False)
 
 
 Run = Annotated[
@@ -392,6 +403,8 @@ Run = Annotated[
         "nor if there is only one in runs/."
     ),
 ]
+
+StudyName = Annotated[str | None, typer.Option(help="Name of the study. Default: the folder's name.")]
 
 
 @app.command()
@@ -419,8 +432,10 @@ def dashboard(
 def report(
     folder: Run = None,
     storage: Storage = None,
-    study: Annotated[str | None, typer.Option(help="Name of the study. Default: the folder's name.")] = None,
-    config: Annotated[Path | None, typer.Option(help="Configuration of the search, for settings and baselines.")] = None,
+    study: StudyName = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Configuration of the search. Default: what the study has noted of it.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
     """Write a report of a search as one HTML file."""
@@ -428,24 +443,256 @@ def report(
         from search import evolve
         from search.config import load_config
         from search.provenance import provenance
-        from search.report import write_report
+        from search.report import stored_baselines, stored_runs, write_report
         from search.storage import load_study, open_storage
 
+        if config is None and folder is not None and folder.suffix in YAML:
+            config = folder
         folder = _search_folder(folder, storage)
         opened = open_storage(storage or str(folder), create=False)
         settings = None if config is None else load_config(config)
-        name = study or (None if folder is None else folder.name)
+        searched = load_study(opened, study or (None if folder is None else folder.name))
         path = out or (folder or Path()) / "report.html"
-        lines = [] if settings is None else evolve.baseline_scores(settings, opened)
+        name = searched.study_name
+        lines = stored_baselines(opened, name) if settings is None else evolve.baseline_scores(settings, opened)
         shown = None if settings is None else evolve.settings(settings)
-        write_report(load_study(opened, name), path, lines, shown, provenance())
+        write_report(searched, path, lines, shown, provenance(), stored_runs(opened, f"{name}-cross-validation"))
         console.print(f"Report: {path}", markup=False, soft_wrap=True, highlight=False)
+
+
+Searches = Annotated[
+    list[Path] | None,
+    typer.Argument(help="Folders of searches, or their configuration files. Default: the only one in runs/."),
+]
+Studies = Annotated[
+    list[str] | None,
+    typer.Option(help="Name of a study in the folder or the --storage; may be given again. Default: the folder's name."),
+]
+Patterns = Annotated[
+    list[str] | None,
+    typer.Option(help='A pattern beside those of table 5, in notation or by name, such as "{s_t} -> {r_t}". Again for more.'),
+]
+Ties = Annotated[bool, typer.Option("--ties-without", help="Count n_target = n_source as not n_target > n_source.")]
+Top = Annotated[int, typer.Option(help="How many of the best candidates the metrics are compared on.", min=1)]
+
+
+# The tables of an analysis in the order in which they are shown, and their titles.
+ANALYSES = {
+    "population": "Trials",
+    "table5": "Patterns: mean score with - without (table 5; Welch's t-test: * p < 0.05, ** p < 0.01)",
+    "importances": "Importances of the tokens (mean decrease of impurity), the highest",
+    "horizon": "Scores by horizon; difference to all others",
+    "operator": "Scores by operator; difference to all others",
+    "operation": "Scores by operation; difference to all others",
+    "diversity": "Diversity of the stages",
+    "lineage": "Lineage of the best; gain over the better parent",
+    "rank_agreement": "Agreement of the metrics; shared among the best {top}",
+    "machines": "Machines and time",
+}
+N_IMPORTANCES = 20
+
+
+@app.command()
+def analyze(
+    folders: Searches = None,
+    storage: Storage = None,
+    study: Studies = None,
+    pattern: Patterns = None,
+    ties_without: Ties = False,
+    top: Top = 10,
+    csv: Annotated[Path | None, typer.Option(help="Folder to write every table to, as NAME-TABLE.csv.")] = None,
+    json: Annotated[Path | None, typer.Option(help="File to write all tables to.")] = None,
+) -> None:
+    """Show what searches teach about losses: patterns (table 5), importances, effects, diversity, lineage, metrics."""
+    with clear_errors():
+        from json import dumps
+
+        from search import analysis
+
+        summaries = {
+            name: analysis.summary(of.get_trials(deepcopy=False), of.direction, _patterns(pattern), ties_without, top)
+            for name, (of, _) in _open_studies(folders, storage, study).items()
+        }
+        if csv is not None:
+            csv.mkdir(parents=True, exist_ok=True)
+            for name, summary in summaries.items():
+                for title, frame in summary.tables.items():
+                    frame.to_csv(csv / f"{name.replace('/', '_')}-{title}.csv")
+        if json is not None:
+            data = {
+                name: {**{title: _records(frame) for title, frame in tables.items()}, "problems": problems}
+                for name, (tables, problems) in summaries.items()
+            }
+            json.write_text(dumps(data, indent=1) + "\n", encoding="utf-8")
+        for name, summary in summaries.items():
+            console.rule(escape(name))
+            for title, heading in ANALYSES.items():
+                if title in summary.tables:
+                    frame = summary.tables[title]
+                    frame = frame.head(N_IMPORTANCES) if title == "importances" else frame
+                    _show_text(analysis.readable(title, frame), heading.format(top=top))
+                elif title in summary.problems:
+                    console.print(f"{heading.format(top=top)}: {summary.problems[title]}", markup=False, soft_wrap=True)
+        if len(summaries) > 1:
+            layout = analysis.table5_layout({name: summary.tables["table5"] for name, summary in summaries.items()})
+            _show_text(layout.rename_axis("study").reset_index(), "Differences of all studies, as the paper's table 5")
+
+
+def _records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
+    """The rows of a table in plain values for JSON, names of rows included."""
+    from json import loads
+
+    return loads(frame.reset_index().to_json(orient="records", double_precision=15))
+
+
+def _show_text(frame: "pd.DataFrame", title: str) -> None:
+    """A table of texts, as wide as it is: cut numbers are wrong ones. Losses are folded where the terminal ends."""
+    table = Table(title=title, title_justify="left")
+    for position, column in enumerate(frame.columns):
+        folds = column == "Loss"
+        table.add_column(
+            escape(str(column)),
+            justify="left" if folds or position == 0 else "right",
+            overflow="fold",
+            no_wrap=not folds,
+            max_width=max(40, console.width - 60) if folds else None,
+        )
+    for row in frame.itertuples(index=False, name=None):
+        table.add_row(*map(escape, row))
+    Console(width=1000).print(table)
+
+
+figures = typer.Typer(no_args_is_help=True, help="Draw the paper's figures from stored data, each as one file.")
+app.add_typer(figures, name="figures")
+Out = Annotated[
+    Path | None,
+    typer.Option(help="File that ends in .png, .pdf or .svg. Default: a .png of the figure's name in the (first) folder."),
+]
+
+
+@figures.command()
+def evolution(folders: Searches = None, storage: Storage = None, study: Studies = None, out: Out = None) -> None:
+    """Scores of all candidates by stage, with baselines where they are trained (figures 4 and 6)."""
+    with clear_errors():
+        from search import analysis, plots
+        from search.report import stored_baselines
+
+        studies = _open_studies(folders, storage, study)
+        lines = {name: stored_baselines(of._storage, of.study_name) for name, (of, _) in studies.items()}
+        directions = {of.direction for of, _ in studies.values()}
+        if len(directions) > 1:
+            raise ValueError(f"some of {', '.join(studies)} are maximized and some minimized: draw them apart")
+        tables = {name: analysis.trial_table(of.get_trials(deepcopy=False)) for name, (of, _) in studies.items()}
+        _save(plots.evolution_plot(tables, lines, directions.pop()), out, "evolution", studies)
+
+
+@figures.command()
+def histogram(
+    folders: Searches = None,
+    storage: Storage = None,
+    study: Studies = None,
+    bins: Annotated[int, typer.Option(help="Number of bins.", min=1)] = 25,
+    out: Out = None,
+) -> None:
+    """Distribution of the scores of up to three searches, such as with and without pruning of the space (figure 7)."""
+    with clear_errors():
+        from search import analysis, plots
+
+        studies = _open_studies(folders, storage, study)
+        tables = {name: analysis.trial_table(of.get_trials(deepcopy=False)) for name, (of, _) in studies.items()}
+        _save(plots.histogram_plot(tables, bins), out, "histogram", studies)
+
+
+@figures.command()
+def curves(
+    folder: Annotated[Path, typer.Argument(help="Folder of a benchmark.")] = Path("runs/benchmark"),
+    smooth: Annotated[int, typer.Option(help="Evaluations over which each run is averaged, centred.", min=1)] = 1,
+    out: Out = None,
+) -> None:
+    """Learning curves of a benchmark with their deviation over seeds (figure 9)."""
+    with clear_errors():
+        from search import plots
+        from search import table as tables
+        from search.benchmark import read_curves
+
+        _write_figure(plots.learning_curves_plot(read_curves(folder), smooth), out or folder / "curves.png")
+        _show_missing(tables.read_runs(folder))
+
+
+@figures.command()
+def rankings(folder: Run = None, storage: Storage = None, study: StudyName = None, top: Top = 10, out: Out = None) -> None:
+    """Learning curves of the best candidates under three metrics (figure 10)."""
+    with clear_errors():
+        from search import analysis, plots
+
+        studies = _open_studies(None if folder is None else [folder], storage, None if study is None else [study])
+        ((of, _),) = studies.values()
+        _save(plots.rankings_plot(analysis.trial_table(of.get_trials(deepcopy=False)), top), out, "rankings", studies)
+
+
+@figures.command()
+def patterns(
+    folders: Searches = None,
+    storage: Storage = None,
+    study: Studies = None,
+    pattern: Patterns = None,
+    ties_without: Ties = False,
+    out: Out = None,
+) -> None:
+    """Scores with and without each pattern of table 5 (figure 11)."""
+    with clear_errors():
+        from search import analysis, plots
+
+        studies = _open_studies(folders, storage, study)
+        tables = {name: analysis.trial_table(of.get_trials(deepcopy=False)) for name, (of, _) in studies.items()}
+        _save(plots.patterns_plot(tables, _patterns(pattern), ties_without), out, "patterns", studies)
+
+
+def _patterns(others: list[str] | None) -> "dict[str, str | AuxLoss]":
+    """Those of table 5, and others under their notation."""
+    from search import analysis
+
+    return {**analysis.PATTERNS, **{text: text for text in others or ()}}
+
+
+def _save(figure: "Figure", out: Path | None, name: str, studies: "dict[str, tuple[Study, Path]]") -> None:
+    """Write a figure of some studies."""
+    first = next(folder for _, folder in studies.values())
+    _write_figure(figure, out or first / f"{name}.png")
+
+
+def _write_figure(figure: "Figure", path: Path) -> None:
+    kinds = figure.canvas.get_supported_filetypes()
+    if path.suffix.removeprefix(".") not in kinds:
+        raise ValueError(f"{path}: figures are written as .{', .'.join(sorted(kinds))}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    console.print(f"Figure: {path}", markup=False, soft_wrap=True, highlight=False)
+
+
+def _open_studies(folders: list[Path] | None, storage: str | None, names: list[str] | None) -> "dict[str, tuple[Study, Path]]":
+    """Studies and their folders by name, one of each folder or several of one storage; by folder where names are alike."""
+    from search.storage import load_study, open_storage
+
+    places = [_search_folder(folder, storage) for folder in folders] if folders else [_search_folder(None, storage)]
+    if names and len(places) > 1:
+        raise ValueError(f"--study names studies of one folder or --storage, but there are {len(places)} folders")
+    found = []
+    for place in places:
+        opened = open_storage(storage or str(place), create=False)
+        of_place = None if place is None else place.name
+        found += [(load_study(opened, name), place or Path()) for name in (names or (of_place,))]
+    alike = len({study.study_name for study, _ in found}) < len(found)
+    studies = {str(place) if alike else study.study_name: (study, place) for study, place in found}
+    if len(studies) < len(found):
+        raise ValueError(f"a study is named twice: {', '.join(study.study_name for study, _ in found)}")
+    return studies
 
 
 def _search_folder(run: Path | None, storage: str | None) -> Path | None:
     """The folder of a search, which its configuration file may name too; if nothing is named, the only one in runs/."""
     if run is not None:
-        return run_folder(run, None) if run.suffix in (".yml", ".yaml") else run
+        return run_folder(run, None) if run.suffix in YAML else run
     if storage is not None:
         return None
     folders = sorted(path.parent for path in Path("runs").glob("*/journal.log"))

@@ -15,6 +15,7 @@ import plotly.graph_objects as go
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial
@@ -274,7 +275,7 @@ def patterns_plot(
         axes.set_xlabel(SCORE, fontsize=9)
     _label_rows(panels, "Share of the class (%)")
     figure.suptitle(_who_each(tables), fontsize=10)
-    _legend(figure, panels[:1])
+    _legend(figure, panels)
     return figure
 
 
@@ -402,7 +403,7 @@ def _label_rows(panels: Sequence[Axes], label: str) -> None:
 
 
 def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
-    """One legend for all panels, each label once."""
+    """One legend for all panels, each label once; what comes last."""
     entries: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -411,6 +412,9 @@ def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
     columns = max(1, int(figure.get_figwidth() / (0.7 + 0.08 * max(map(len, entries), default=0))))
     handles = list(entries.values())
     figure.legend(handles, list(entries), loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+    # A $ in the name of a study or a file is no formula.
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
 
 
 def _histograms(axes: Axes, scores: Mapping[str, pd.Series], bins: int | Sequence[float]) -> None:

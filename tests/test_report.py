@@ -8,6 +8,7 @@ import lxml.html
 import numpy as np
 import optuna
 import pytest
+import scipy.stats
 from browser import open_browser, requested
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,7 +19,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from search.notation import mathml, subscripts
-from search.report import stage_rows, time_spent, write_report
+from search.report import stage_rows, stored_baselines, stored_runs, time_spent, write_report
 from search.sampler import AuxLossSampler
 from search.space import distributions, loss_to_params, random_loss, suggest_aux_loss
 
@@ -81,8 +82,11 @@ def study():
         value = float(rng.normal(100 * stage, 50)) if state == TrialState.COMPLETE else None
         attrs = {"stage": stage, "place": number % 10 % 8, "operation": "horizon_change" if stage > 1 else "random"}
         attrs |= {"parents": [int(rng.integers(10 * (stage - 2), 10 * (stage - 1)))] if stage > 1 else []}
+        attrs |= {"device": "GPU: some", "threads": 9} if number % 2 else {"device": "CPU: 2 cores", "threads": 2}
         attrs |= {"curve": [[1000, 10.0, 1.0], [2000, 20.0, 2.0]]} if number % 3 == 0 else {}
-        study.add_trial(make_trial(number, state, value, 60 + number, **attrs))
+        trial = make_trial(number, state, value, 60 + number, **attrs)
+        trial.user_attrs["loss"] = str(random_loss(np.random.default_rng(number), 3))
+        study.add_trial(trial)
     return study
 
 
@@ -98,7 +102,7 @@ def read_page(path):
 
 
 def table_after(page, heading):
-    table = page.xpath(f"//h2[normalize-space()='{heading}']/following-sibling::table[1]")[0]
+    table = page.xpath(f"//h2[normalize-space()='{heading}']/following::table[1]")[0]
     return [[cell.text_content().strip() for cell in row.xpath("./td")] for row in table.xpath(".//tr[td]")]
 
 
@@ -149,7 +153,97 @@ def test_what_the_report_says(study, tmp_path):
     assert table_after(page, "Settings") == [["environment", EVIL]]
     assert table_after(page, "Where it comes from") == [["commit", "abc123"], ["cpu", "2 cores"]]
     assert page.xpath("//h2[normalize-space()='Learning curves']")
-    assert not page.xpath("//img | //link | //iframe | //*[@src]")
+    assert not page.xpath("//link | //iframe")
+    addresses = page.xpath("//@src | //@href")
+    assert len(addresses) == 2 and all(address.startswith("data:image/svg+xml;base64,") for address in addresses)
+
+
+# Section 3.3, typed in again.
+PATTERNS = {
+    "Forward dynamics": ("s_t a_t", "s_t+1"),
+    "Inverse dynamics": ("a_t s_t+1", "s_t"),
+    "Reward prediction": ("s_t a_t", "r_t"),
+    "Action inference": ("s_t s_t+1", "a_t"),
+    "State reconstruction": ("s_t", "s_t"),
+}
+
+
+def test_table_5_of_the_report(study, tmp_path):
+    write_report(study, tmp_path / "report.html")
+    rows = {row[0]: row[1:] for row in table_after(read_page(tmp_path / "report.html"), "Patterns")}
+    assert len(rows) == 8
+    for name, pattern in PATTERNS.items():
+        classes = {True: [], False: []}
+        for trial in completed(study):
+            sides = trial.user_attrs["loss"].split(" -> ")
+            has = all(
+                set(few.split()) <= set(re.findall(r"[sar]_t(?:\+\d+)?", many))
+                for few, many in zip(pattern, sides, strict=True)
+            )
+            classes[has].append(trial.value)
+        n_with, n_without = len(classes[True]), len(classes[False])
+        assert n_without > 1 and rows[name][-3:] == [str(n_with), str(n_without), "0"]
+        if n_with > 1:
+            p = scipy.stats.ttest_ind(classes[True], classes[False], equal_var=False).pvalue
+            stars = "**" if p < 0.01 else "*" if p < 0.05 else ""
+            difference = np.mean(classes[True]) - np.mean(classes[False])
+            assert rows[name][:2] == [f"{difference:+.2f}{stars}", f"{p:.2g}"]
+    assert sum(int(row[-3]) > 1 for row in rows.values()) >= 4
+
+
+def test_machines_and_hours(study, tmp_path):
+    write_report(study, tmp_path / "report.html")
+    rows = table_after(read_page(tmp_path / "report.html"), "Machines and time")
+    hours = [sum(60 + number for number in range(begin, 28, 2)) / 3600 for begin in (0, 1)]
+    assert rows == [
+        ["CPU: 2 cores", "not noted", "14", f"{hours[0]:.2f}", f"{2 * hours[0]:.2f}"],
+        ["GPU: some", "not noted", "14", f"{hours[1]:.2f}", "–"],
+    ]
+
+
+def test_what_other_studies_of_the_storage_add(study, tmp_path):
+    """Baselines, and the candidates of the cross-validation that have all runs."""
+    storage = optuna.storages.InMemoryStorage()
+    losses = ["{s_t} -> {s_t+1}", "{s_t} -> {r_t}", "{s_t} -> {a_t}"]
+    runs = [(losses[i], f"dm_control/{env}-v0", seed, 10.0 * i + seed) for i in range(3) for env in "ab" for seed in (0, 1)]
+    of_studies = {"x-cross-validation": runs[:-1], "x-baselines": [("SAC", "a", 0, 3.0), ("SAC", "a", 1, 4.0)]}
+    for name, trials in of_studies.items():
+        other = optuna.create_study(study_name=name, storage=storage, direction="maximize")
+        for variant, env, seed, score in trials:
+            attrs = {"variant": variant, "environment": env, "seed": seed, "curve": [[1, score, 0.0]]}
+            other.add_trial(optuna.trial.create_trial(value=score, user_attrs=attrs))
+        other.add_trial(optuna.trial.create_trial(state=TrialState.FAIL))
+    assert stored_baselines(storage, "x") == [("SAC", 3.5)] and stored_baselines(storage, "y") == []
+    write_report(study, tmp_path / "report.html", validation=stored_runs(storage, "x-cross-validation"))
+    page = read_page(tmp_path / "report.html")
+    rows = table_after(page, "Cross-validation")
+    assert [row[0].endswith(loss) for row, loss in zip(rows, losses[1::-1], strict=True)] == [True, True]
+    assert [row[1:] for row in rows] == [["10.5", "10.5", "10.5", "0.5", "4"], ["0.5", "0.5", "0.5", "0.5", "4"]]
+    assert "1 without all runs are left out." in " ".join(page.text_content().split())
+    write_report(study, tmp_path / "report.html", validation=stored_runs(storage, "nothing"))
+    assert "Cross-validation" not in read_page(tmp_path / "report.html").text_content()
+
+
+def test_settings_are_those_that_the_study_has_noted(study, tmp_path):
+    noted = {"environment": "Pendulum-v1", "checkpoints": [2000, 40000], "evaluation_episodes": 3}
+    study.set_user_attr("training", {"candidates": noted})
+    write_report(study, tmp_path / "report.html")
+    page = read_page(tmp_path / "report.html")
+    assert ["checkpoints", "[2000, 40000]"] in table_after(page, "Settings")
+    text = " ".join(page.text_content().split())
+    assert "trained on Pendulum-v1 and evaluated at 2,000, 40,000 environment steps with 3 episodes." in text
+
+
+@pytest.mark.parametrize("curves", [{}, {"curve": [[1, 1.0, 0.0]]}])
+def test_report_of_scores_that_are_all_alike(tmp_path, curves):
+    study = optuna.create_study(study_name="a $x_{ $ b", direction="maximize")
+    for number in range(4):
+        attrs = curves if number % 2 else {key: [[2, 1.0, 0.0]] for key in curves}
+        study.add_trial(make_trial(number, TrialState.COMPLETE, 1.0, 1, **attrs))
+    write_report(study, tmp_path / "report.html")
+    text = " ".join(read_page(tmp_path / "report.html").text_content().split())
+    assert "importances need different scores; there are 4 complete trials, all alike." in text
+    assert ("their learning curves cannot be compared." if curves else "no complete trial has a learning curve.") in text
 
 
 @pytest.mark.parametrize("states", [[], [TrialState.FAIL, TrialState.RUNNING]])
@@ -203,6 +297,14 @@ def test_in_a_real_browser(study, tmp_path):
         size = [float(part.value_of_css_property("font-size")[:-2]) for part in (base, subscript)]
         assert size[1] < size[0]
         assert browser.title.startswith("study <script>")
+        # Table 5 is shown as it is, and the pictures are drawn, each as wide as the text.
+        patterns = browser.find_element(By.XPATH, "//h2[.='Patterns']/following-sibling::div[1]")
+        assert "Action, n_target > n_source" in patterns.text and patterns.is_displayed()
+        pictures = browser.find_elements(By.CSS_SELECTOR, "figure img")
+        assert len(pictures) == 2 and all(picture.get_attribute("alt") for picture in pictures)
+        for picture in pictures:
+            assert int(picture.get_attribute("naturalWidth")) > 300
+            assert picture.rect["width"] == pytest.approx(patterns.rect["width"], abs=1) and picture.rect["height"] > 200
         assert [trial.number for trial in best[:10]] == [
             int(row.find_elements(By.TAG_NAME, "td")[1].text)
             for row in browser.find_elements(By.XPATH, "//h2[.='Best losses']/following-sibling::table[1]/tbody/tr")
