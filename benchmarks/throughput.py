@@ -31,7 +31,7 @@ def train(setting: str, device: str, mode: str, threads: int, seconds: float, ba
     th.set_num_threads(threads)
     model = ours(setting, device, **modes(device)[mode])
     model.set_logger(configure(None, []))
-    fill(model, 1000)
+    fill(model, 2000)
     model.train(10 if device == "cuda" else 2, BATCH[setting])
     synchronize(device)
     barrier.wait()

@@ -37,6 +37,7 @@ ACTION_DIM = 6
 STATE_DIM = 17
 EPISODE = 250
 BATCH = {"state": 512, "pixels": 128}
+TRANSITIONS = {"state": 20_000, "pixels": 2000}
 PARTS = ("drawing", "critic", "actor", "auxiliary", "targets")
 
 
@@ -85,7 +86,12 @@ def sb3(setting: str, device: str) -> SAC:
         kwargs["features_extractor_class"] = PixelEncoder
     policy = "MlpPolicy" if setting == "state" else "CnnPolicy"
     return SAC(
-        policy, RandomEnv(setting, 84), batch_size=BATCH[setting], buffer_size=2000, policy_kwargs=kwargs, device=device
+        policy,
+        RandomEnv(setting, 84),
+        batch_size=BATCH[setting],
+        buffer_size=TRANSITIONS[setting],
+        policy_kwargs=kwargs,
+        device=device,
     )
 
 
@@ -93,7 +99,9 @@ def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
     policy = "MlpPolicy" if setting == "state" else "CnnPolicy"
     if setting == "pixels":
         kwargs["replay_buffer_kwargs"] = {"frame_stack": 3, **kwargs.get("replay_buffer_kwargs", {})}
-    return SACAux(policy, RandomEnv(setting, 100), batch_size=BATCH[setting], buffer_size=2000, device=device, **kwargs)
+    return SACAux(
+        policy, RandomEnv(setting, 100), batch_size=BATCH[setting], buffer_size=TRANSITIONS[setting], device=device, **kwargs
+    )
 
 
 def modes(device: str) -> dict[str, dict[str, Any]]:
@@ -182,8 +190,8 @@ def measure(setting: str, device: str, variants: dict[str, dict[str, Any]], roun
     models |= {name: ours(setting, device, **kwargs) for name, kwargs in variants.items()}
     for model in models.values():
         model.set_logger(configure(None, []))
-        fill(model, 2000)
-        model.train(4, model.batch_size)  # allocates, warms up, captures
+        fill(model, TRANSITIONS[setting])
+        model.train(8, model.batch_size)  # allocates, warms up; both graphs are captured in the last two
     seconds: dict[str, list[float]] = {name: [] for name in models}
     for _ in range(rounds):
         for name, model in models.items():

@@ -85,8 +85,9 @@ class AuxHead(nn.Module):
         if n_states:
             latent = encode(_select(windows.observations, places))
             parts.append(latent.unflatten(0, (n_states, batch)).transpose(0, 1).flatten(start_dim=1))
-        parts.append(windows.actions[:, offsets(tokens, "a")].flatten(start_dim=1))
-        parts.append(windows.rewards[:, offsets(tokens, "r")].flatten(start_dim=1))
+        # One by one: a list as an index would make a GPU wait for it.
+        parts += [windows.actions[:, offset] for offset in offsets(tokens, "a")]
+        parts += [windows.rewards[:, offset] for offset in offsets(tokens, "r")]
         return th.cat(parts, dim=1)
 
 

@@ -1,8 +1,9 @@
 """WindowReplayBuffer: windows of consecutive steps out of a replay buffer that stores each frame once."""
 
 import math
-import sys
+import weakref
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +40,7 @@ def _equal(one: np.ndarray, other: np.ndarray) -> bool:
     return bool((one == other).all()) or np.array_equal(one, other, equal_nan=True)
 
 
-# Memory that drawn observations used and that others may use again: pieces, and bytes of each at most.
+# Memory that drawn observations had, and that others may have after them: pieces and bytes in all, at most.
 MAX_SCRATCH, MAX_SCRATCH_BYTES = 8, 2**28
 
 
@@ -79,7 +80,8 @@ class FrameStore:
         self.device = device
         self.frames = self._zeros((buffer_size + stack, n_envs, *self.frame_shape))
         self.final_frames = self._zeros((0, *self.frame_shape))
-        self._scratch: list[np.ndarray] = []
+        # Pieces of memory, each with a reference to the part of it that was given out last.
+        self._scratch: list[tuple[np.ndarray, weakref.ref[np.ndarray]]] = []
 
     def _zeros(self, shape: tuple[int, ...]) -> Any:
         zeros = np.zeros(shape, self.dtype)
@@ -87,7 +89,9 @@ class FrameStore:
 
     def _here(self, array: np.ndarray) -> Any:
         """An array, as what indexes the frames and may be written to them."""
-        return array if self.device is None else th.as_tensor(np.ascontiguousarray(array), device=self.device)
+        if self.device is None or isinstance(array, th.Tensor):
+            return array
+        return th.as_tensor(np.ascontiguousarray(array), device=self.device)
 
     def __getstate__(self) -> dict[str, Any]:
         state = {**self.__dict__, "_scratch": []}
@@ -97,7 +101,7 @@ class FrameStore:
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
+        self.__dict__.update({"device": None, "_scratch": [], "dtype": state["frames"].dtype, **state})
         if self.device is not None and self.device.type == "cuda" and not th.cuda.is_available():
             self.device = None
         self.frames, self.final_frames = self._here(self.frames), self._here(self.final_frames)
@@ -186,18 +190,18 @@ class FrameStore:
 
     def _empty(self, shape: tuple[int, int], like: th.Tensor) -> th.Tensor:
         """Memory to write to. On a CPU new memory costs more than copying to it: what nobody looks at is used again."""
-        if like.is_cuda:
+        if like.device.type != "cpu":
             return like.new_empty(shape)
         size = math.prod(shape)
-        for array in self._scratch:
-            # Seen from the list, from this loop and from the call: then no tensor that was given out is left.
-            if len(array) >= size and sys.getrefcount(array) == 3:
-                return th.from_numpy(array[:size]).view(shape)
-        array = np.empty(size, self.dtype)
-        if array.nbytes <= MAX_SCRATCH_BYTES:
-            # The smallest first, so that it is what a batch takes which fits.
-            self._scratch = sorted([array, *self._scratch[-MAX_SCRATCH + 1 :]], key=len)
-        return th.from_numpy(array[:size]).view(shape)
+        # Every tensor and array that was made of a part of a piece would keep that part alive. The newest is likely cached.
+        fits = [size <= len(piece) <= 2 * size and part() is None for piece, part in self._scratch]
+        found = max((i for i, fit in enumerate(fits) if fit), default=None)
+        piece = np.empty(size, self.dtype) if found is None else self._scratch.pop(found)[0]
+        part = piece[:size]
+        self._scratch.append((piece, weakref.ref(part)))
+        while len(self._scratch) > MAX_SCRATCH or sum(piece.nbytes for piece, _ in self._scratch) > MAX_SCRATCH_BYTES:
+            del self._scratch[0]
+        return th.from_numpy(part).view(shape)
 
     def put_final(self, slot: int, frame: Any) -> None:
         """Lay an episode's last frame aside; the space for them doubles when it is full."""
@@ -291,7 +295,6 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self.gamma = gamma
 
         parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
-        self._image_keys = {key for key, space in parts.items() if is_image_space(space)}
         if isinstance(frame_stack, Mapping) and not set(frame_stack) <= set(parts):
             raise ValueError(f"frame_stack={dict(frame_stack)} names keys that observations do not have: {sorted(parts)}")
         self.storage_device = None if storage_device is None else get_device(storage_device)
@@ -324,6 +327,12 @@ class WindowReplayBuffer(NStepReplayBuffer):
         """Forget everything."""
         super().reset()
         self._clear()
+
+    @cached_property
+    def _image_keys(self) -> set[str]:
+        space = self.observation_space
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+        return {key for key, part in parts.items() if is_image_space(part)}
 
     @property
     def observations(self) -> Any:  # type: ignore[override]
@@ -486,7 +495,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
             each observation at a place of its own; None for no crop. n-step returns come without crops
         """
         upper = self.buffer_size if self.full else self.pos
-        return self._get_samples(np.random.randint(0, upper, size=batch_size), env, crop_size)
+        positions = np.random.randint(0, upper, size=batch_size)
+        # A user's class may have SB3's arguments only.
+        return self._get_samples(positions, env, **({} if crop_size is None else {"crop_size": crop_size}))
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None, crop_size: int | None = None
@@ -499,10 +510,10 @@ class WindowReplayBuffer(NStepReplayBuffer):
         samples = DictReplayBufferSamples if isinstance(self.observation_space, spaces.Dict) else ReplayBufferSamples
         return samples(
             self._gather_all(batch_inds, envs, False, env, crop_size),
-            self.to_torch(self.actions[batch_inds, envs]),
+            self.to_torch(self.actions[batch_inds, envs], copy=False),
             self._gather_all(batch_inds, envs, True, env, crop_size),
-            self.to_torch(dones[:, None]),
-            self.to_torch(self._normalize_reward(self.rewards[batch_inds, envs][:, None], env)),
+            self.to_torch(dones[:, None], copy=False),
+            self.to_torch(self._normalize_reward(self.rewards[batch_inds, envs][:, None], env), copy=False),
         )
 
     def _gather_all(
@@ -520,17 +531,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
             arrays: dict[str, Any] = {key: part.cpu().numpy() for key, part in parts.items()}
             normalized: Any = self._normalize_obs(arrays.get("", arrays), env)
             parts = normalized if isinstance(normalized, dict) else {"": normalized}
-        tensors = {key: self.to_torch(part) for key, part in parts.items()}
+        tensors = {key: th.as_tensor(part, device=self.device) for key, part in parts.items()}
         return tensors.get("", tensors)
-
-    def to_torch(self, array: Any, copy: bool = True) -> th.Tensor:
-        """
-        As in SB3, without the copy: what is drawn here is new anyway.
-
-        :param array: Array or tensor
-        :param copy: Accepted for SB3
-        """
-        return th.as_tensor(array, device=self.device)
 
     def _draw_windows(self, batch_size: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
         """Positions of the last steps, and envs, of windows, uniform over all whole ones."""
@@ -580,8 +582,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
             {key: value.transpose(0, 1) for key, value in observations.items()}
             if isinstance(observations, dict)
             else observations.transpose(0, 1),
-            self.to_torch(self.actions[steps, envs[:, None]]),
-            self.to_torch(rewards),
+            self.to_torch(self.actions[steps, envs[:, None]], copy=False),
+            self.to_torch(rewards, copy=False),
         )
 
 

@@ -1,5 +1,6 @@
 """A gradient step as CUDA graphs: recorded once, then launched as a whole instead of some hundred kernels one by one."""
 
+import copy
 import logging
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
@@ -27,16 +28,25 @@ class GraphedStep:
     flags and shapes. Where it cannot be recorded one line of log says why, and it runs as it is from then on.
 
     :param step: From nested tuples and dicts of tensors, None, and flags, to scalars by name. It must not wait for the GPU
+    :param device: The CUDA device of all tensors
     """
 
-    def __init__(self, step: Callable[..., dict[str, th.Tensor]]):
+    def __init__(self, step: Callable[..., dict[str, th.Tensor]], device: th.device):
         self.step = step
+        self.device = device
         self.recordings: dict[Hashable, _Recording] = {}
         self.seen: Counter[Hashable] = Counter()
-        self.stream = th.cuda.Stream()
+        self.stream = th.cuda.Stream(device)
         self.works = True
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "GraphedStep":
+        return GraphedStep(copy.deepcopy(self.step, memo), self.device)  # a recording belongs to the tensors it was made of
+
     def __call__(self, *arguments: Any) -> dict[str, th.Tensor]:
+        with th.cuda.device(self.device):
+            return self._run(arguments)
+
+    def _run(self, arguments: tuple[Any, ...]) -> dict[str, th.Tensor]:
         if not self.works:
             return self.step(*arguments)
         key = _key(arguments)
@@ -54,7 +64,11 @@ class GraphedStep:
                 logger.warning("No CUDA graph, the gradient step runs kernel by kernel: %s", str(error).splitlines()[0])
                 self.works = False
                 self.recordings.clear()
-                return self.step(*arguments)
+                try:
+                    return self.step(*arguments)
+                except RuntimeError as consequence:
+                    # Some versions of PyTorch leave their random generator in the recording that was broken off.
+                    raise RuntimeError("recording a CUDA graph failed for good: train with compile=None") from consequence
         graph, inputs, outputs = self.recordings[key]
         th._foreach_copy_(inputs, list(_leaves(arguments)))
         graph.replay()
@@ -64,14 +78,14 @@ class GraphedStep:
     def _record(self, arguments: tuple[Any, ...]) -> _Recording:
         static = _map(th.clone, arguments)
         graph = th.cuda.CUDAGraph()
-        with _unchecked_distributions(), th.cuda.graph(graph):
+        with unchecked_distributions(), th.cuda.graph(graph, stream=self.stream):
             outputs = self.step(*static)
         return _Recording(graph, list(_leaves(static)), outputs)
 
 
 @contextmanager
-def _unchecked_distributions() -> Iterator[None]:
-    """PyTorch's distributions wait for the GPU to check their parameters, which a recording cannot."""
+def unchecked_distributions() -> Iterator[None]:
+    """PyTorch's distributions check their parameters, for which they wait for the GPU; a recording cannot do that."""
     before = Distribution._validate_args
     Distribution.set_default_validate_args(False)
     try:

@@ -1,6 +1,7 @@
 """Encoders: SB3 features extractors from observations to the latent states that the auxiliary loss works on."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
@@ -108,6 +109,17 @@ class PixelEncoder(Encoder):
         self.convolutions = nn.Sequential(*layers).apply(orthogonal_init)
         self.convolutions.to(memory_format=th.channels_last)  # type: ignore[call-overload]
         self.projection = self.make_projection()
+
+    # PyTorch keeps it beside the parameters. In version 1 the trunk was flattened channels first.
+    _version = 2
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, local_metadata: dict[str, Any], *args: Any) -> None:
+        if local_metadata.get("version", self._version) < self._version:
+            raise RuntimeError(
+                "this model was saved by a version of sb3-aarl that laid images out in another way (channels first): "
+                "its encoder cannot be used any more, train it again"
+            )
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, *args)
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
         # Flattened as they lie in memory, channels last, so that nothing is copied.

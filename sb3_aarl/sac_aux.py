@@ -5,7 +5,7 @@ import logging
 import pathlib
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -24,7 +24,7 @@ from sb3_aarl import catalog
 from sb3_aarl.aux_head import AuxHead
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
-from sb3_aarl.cuda_graph import GraphedStep
+from sb3_aarl.cuda_graph import GraphedStep, unchecked_distributions
 from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy, image_spaces
 
 logger = logging.getLogger(__name__)
@@ -95,7 +95,8 @@ class SACAux(SAC):
     :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16, while parameters, optimizers,
         Q targets, entropy and losses stay float32. Predictions are made in float32
     :param compile: ``"cudagraphs"``: on a GPU, the gradient step is one captured CUDA graph. Elsewhere, or where it cannot be
-        captured, one line of log says so and the step runs as it does with None
+        captured, one line of log says so and the step runs as it does with None. What is no tensor (``gamma``, ``tau``,
+        ``aux_coef``) keeps the value of the capture; learning rates may change. It cannot be used with gSDE
     :param allow_tf32: Whether float32 products and convolutions of the gradient step may use TF32 on a GPU; None for
         PyTorch's own settings (convolutions only)
     :raises ValueError: for arguments that do not fit, with the culprit's name
@@ -257,10 +258,12 @@ class SACAux(SAC):
             if self.device.type != "cuda":
                 problem = f"needs a CUDA device, not {self.device}"
             elif not all("capturable" in optimizer.param_groups[0] for optimizer in self._optimizers()):
-                problem = f"needs optimizers that can be captured, as {th.optim.Adam.__name__} can"
+                problem = "needs optimizers that can be captured, as Adam can"
+            elif self.use_sde:
+                problem = "cannot be used with gSDE, whose noise lives on between gradient steps"
             else:
                 problem = None
-                self._graphed_step = GraphedStep(self._gradient_step)
+                self._graphed_step = GraphedStep(self._gradient_step, self.device)
             if problem is not None:
                 logger.warning("compile=%r %s: the gradient step runs as without", self.compile, problem)
 
@@ -352,7 +355,7 @@ class SACAux(SAC):
             batch, windows = self._draw(batch_size)
             update_actor = self._n_updates % self.policy_delay == 0
             update_target = self._n_updates % self.target_update_interval == 0
-            with self._tf32():
+            with self._gpu_settings():
                 logs.append(step(batch, windows, update_actor, update_target))
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -376,7 +379,7 @@ class SACAux(SAC):
         """
         assert self.replay_buffer is not None
         crop: dict[str, Any] = {}
-        if self.policy.crops and isinstance(self.replay_buffer, WindowReplayBuffer):
+        if self.policy.crops and type(self.replay_buffer) is WindowReplayBuffer:
             crop["crop_size"] = self.policy.crop_size  # while frames are gathered: augment() finds nothing left to crop
         env = self._vec_normalize_env
         batch = self.replay_buffer.sample(batch_size, env=env, **crop)
@@ -530,17 +533,15 @@ class SACAux(SAC):
                     group["lr"] = th.tensor(schedule(progress), device=self.device)
 
     @contextmanager
-    def _tf32(self) -> Iterator[None]:
-        """PyTorch's settings of TF32 as ``allow_tf32`` says."""
-        if self.allow_tf32 is None:
-            yield
-            return
-        backends: tuple[Any, ...] = (th.backends.cuda.matmul, th.backends.cudnn)
+    def _gpu_settings(self) -> Iterator[None]:
+        """PyTorch's settings of TF32 as ``allow_tf32`` says; on a GPU no distribution waits for a check of its parameters."""
+        backends: tuple[Any, ...] = () if self.allow_tf32 is None else (th.backends.cuda.matmul, th.backends.cudnn)
         before = [backend.allow_tf32 for backend in backends]
         for backend in backends:
             backend.allow_tf32 = self.allow_tf32
         try:
-            yield
+            with nullcontext() if self.device.type == "cpu" else unchecked_distributions():
+                yield
         finally:
             for backend, allowed in zip(backends, before, strict=True):
                 backend.allow_tf32 = allowed
@@ -672,6 +673,9 @@ class SACAux(SAC):
                 "new model with aux_loss=None to train without"
             )
         super().set_parameters(load_path_or_dict, exact_match, device)  # type: ignore[arg-type]
+        if self._graphed_step is not None:
+            # What was recorded reads and writes the tensors that the optimizers had before.
+            self._graphed_step = GraphedStep(self._gradient_step, self.device)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -777,6 +777,36 @@ def test_memory_of_batches_is_used_again_once_nobody_has_them():
     assert len(places) <= 2
 
 
+def test_memory_that_is_kept_for_others_is_bounded():
+    buffer = image_buffer(3)
+    for n in (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000, 30_000):
+        small = buffer.sample_windows(1, 3).observations  # does not hold on to what a large batch had
+        assert buffer.sample_windows(n, 3).observations.shape[0] == n
+        assert max(len(piece) for piece, part in buffer.stores[""]._scratch if part() is not None) <= 2 * small.numel()
+    scratch = buffer.stores[""]._scratch
+    assert len(scratch) <= 8 and sum(piece.nbytes for piece, _ in scratch) <= 2**28
+    assert not pickle.loads(pickle.dumps(buffer)).stores[""]._scratch
+
+
+def test_a_class_of_a_users_own_may_have_sb3s_arguments():
+    class Mine(WindowReplayBuffer):
+        def _get_samples(self, batch_inds, env=None):
+            return super()._get_samples(np.zeros_like(batch_inds), env)
+
+    buffer = Mine(20, observation_space(1), ACTIONS, "cpu")
+    filled(buffer, 15, [(9, "truncated")], stack=1, padding="repeat")
+    assert len(np.unique(buffer.sample(30).actions, axis=0)) == 1
+
+
+@pytest.mark.parametrize("storage", [None, "cpu"])
+def test_to_torch_copies_as_sb3s_does(storage):
+    buffer = make_buffer(20, storage_device=storage)
+    filled(buffer, 15, [(9, "truncated")], stack=1, padding="repeat")
+    before = buffer.actions.copy()
+    buffer.to_torch(buffer.actions).zero_()
+    assert_same(buffer.actions, before)
+
+
 def test_normalized_images_are_not_cropped():
     """VecNormalize's statistics are those of whole images."""
     space = spaces.Box(0, 255, (2, *SIZE), np.float32)

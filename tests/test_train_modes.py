@@ -178,6 +178,17 @@ def test_what_a_recording_depends_on() -> None:
     assert len({_key(arguments), *map(_key, others)}) == 4
 
 
+def test_a_model_whose_images_were_laid_out_in_another_way_is_refused() -> None:
+    model = make_model("pixels")
+    parameters = model.get_parameters()
+    model.set_parameters(parameters)
+    for key, metadata in parameters["policy"]._metadata.items():
+        assert metadata["version"] == (2 if key.endswith("features_extractor") else 1)
+        metadata["version"] = 1
+    with pytest.raises(RuntimeError, match="saved by a version of sb3-aarl that laid images out in another way"):
+        model.set_parameters(parameters)
+
+
 @needs_cuda
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
@@ -201,8 +212,23 @@ def test_a_cuda_graph_is_the_eager_step(kind: str, precision: str) -> None:
 
 
 @needs_cuda
+def test_parameters_that_are_set_reach_the_graph() -> None:
+    models = [filled_model(compile=mode, device="cuda", allow_tf32=False) for mode in (None, "cudagraphs")]
+    for model in models:
+        model.train(12, batch_size=16)
+        model.set_parameters(models[0].get_parameters())
+        np.random.seed(0)
+        th.manual_seed(0)
+        model.train(12, batch_size=16)
+    for name, value in everything(models[0]).items():
+        if isinstance(value, th.Tensor):
+            th.testing.assert_close(everything(models[1])[name], value, rtol=1e-2, atol=1e-3)
+
+
+@needs_cuda
 def test_storage_on_the_gpu() -> None:
     model = make_model("pixels", device="cuda", replay_buffer_kwargs={"storage_device": "cuda"}).learn(60)
+    model.learn(20)  # begins with a reset that nobody was told of
     batch, windows = model._draw(16)
     assert batch.observations.is_cuda and windows.observations.is_cuda
     assert model.replay_buffer.stores[""].frames.is_cuda
