@@ -436,6 +436,7 @@ def report(
     config: Annotated[
         Path | None, typer.Option(help="Configuration of the search. Default: what the study has noted of it.")
     ] = None,
+    benchmark: Annotated[Path | None, typer.Option(help="Folder of a benchmark whose tables and curves it shows too.")] = None,
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
     """Write a report of a search as one HTML file."""
@@ -448,7 +449,7 @@ def report(
 
         if config is None and folder is not None and folder.suffix in YAML:
             config = folder
-        folder = _search_folder(folder, storage)
+        folder = _search_folder(folder, storage, benchmarks=False)
         opened = open_storage(storage or str(folder), create=False)
         settings = None if config is None else load_config(config)
         searched = load_study(opened, study or (None if folder is None else folder.name))
@@ -456,7 +457,7 @@ def report(
         name = searched.study_name
         lines = stored_baselines(opened, name) if settings is None else evolve.baseline_scores(settings, opened)
         shown = None if settings is None else evolve.settings(settings)
-        write_report(searched, path, lines, shown, provenance(), stored_runs(opened, f"{name}-cross-validation"))
+        write_report(searched, path, lines, shown, provenance(), stored_runs(opened, f"{name}-cross-validation"), benchmark)
         console.print(f"Report: {path}", markup=False, soft_wrap=True, highlight=False)
 
 
@@ -674,7 +675,8 @@ def _open_studies(folders: list[Path] | None, storage: str | None, names: list[s
     """Studies and their folders by name, one of each folder or several of one storage; by folder where names are alike."""
     from search.storage import load_study, open_storage
 
-    places = [_search_folder(folder, storage) for folder in folders] if folders else [_search_folder(None, storage)]
+    given: list[Path | None] = [*folders] if folders else [None]
+    places = [_search_folder(folder, storage, benchmarks=False) for folder in given]
     if names and len(places) > 1:
         raise ValueError(f"--study names studies of one folder or --storage, but there are {len(places)} folders")
     found = []
@@ -689,13 +691,28 @@ def _open_studies(folders: list[Path] | None, storage: str | None, names: list[s
     return studies
 
 
-def _search_folder(run: Path | None, storage: str | None) -> Path | None:
-    """The folder of a search, which its configuration file may name too; if nothing is named, the only one in runs/."""
+def _search_folder(run: Path | None, storage: str | None, benchmarks: bool = True) -> Path | None:
+    """
+    The folder of a search, which its configuration file may name too; if nothing is named, the only one in runs/.
+
+    Benchmarks leave a study too, of runs without candidates, which can be watched but teach nothing about losses.
+    """
+    from search.benchmark import ABOUT
+
+    def is_benchmark(folder: Path) -> bool:
+        return any(folder.glob(f"*/*/*/{ABOUT}"))
+
     if run is not None:
+        if not benchmarks and is_benchmark(run):
+            raise ValueError(
+                f"{run} is a benchmark, no search: see aarl table {run}, aarl figures curves {run}, "
+                f"aarl report SEARCH --benchmark {run}"
+            )
         return run_folder(run, None) if run.suffix in YAML else run
     if storage is not None:
         return None
     folders = sorted(path.parent for path in Path("runs").glob("*/journal.log"))
+    folders = [folder for folder in folders if benchmarks or not is_benchmark(folder)]
     if len(folders) != 1:
         there = ", ".join(map(str, folders)) or "none"
         raise ValueError(f"name the folder of a search, or its --storage; there are: {there}")

@@ -149,7 +149,7 @@ def _style(figure: go.Figure, title: str, x_label: str, y_label: str) -> None:
         hovermode="closest",
     )
     figure.update_xaxes(title={"text": x_label}, **AXIS)
-    figure.update_yaxes(title={"text": y_label}, **AXIS)
+    figure.update_yaxes(title={"text": y_label, "standoff": 12}, automargin=True, **AXIS)
 
 
 def learning_curve_png(curve: Sequence[tuple[int, float, float]], title: str) -> bytes:

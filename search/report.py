@@ -19,12 +19,15 @@ from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 from plotly.io import to_html
+from rich.table import Table
+from rich.text import Text
 
 from sb3_aarl.aux_loss import AuxLoss
 from search import analysis, cross_validation, grid
-from search.benchmark import task_name
+from search import table as tables
+from search.benchmark import read_curves, task_name
 from search.notation import mathml
-from search.plots import evolution_figure, learning_curves_figure, patterns_plot, rankings_plot
+from search.plots import evolution_figure, learning_curves_figure, learning_curves_plot, patterns_plot, rankings_plot
 from search.sampler import SETTINGS_KEY
 from search.storage import load_study
 from search.trials import lineage, loss_of, operation_of, parents_of, ranked, score_of, stage_of
@@ -132,6 +135,7 @@ def write_report(
     settings: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
     validation: pd.DataFrame | None = None,
+    benchmark: Path | None = None,
 ) -> None:
     """
     Write the report of a study, finished or not.
@@ -142,6 +146,8 @@ def write_report(
     :param settings: Names and values of the search's settings; None for what the study itself has noted
     :param provenance: As ``search.provenance.provenance`` gives it
     :param validation: Runs of the cross-validation, as :func:`stored_runs` gives them
+    :param benchmark: Folder of a benchmark whose tables and learning curves are shown too
+    :raises ValueError: when there is no benchmark in the folder
     """
     trials = study.get_trials(deepcopy=False)
     baselines = list(baselines)
@@ -169,6 +175,7 @@ def write_report(
         lineage=[_row(other) for other in sorted(lineage(winner, trials), key=lambda other: -other.number)] if winner else [],
         validation=_validation(validation),
         taught=_taught(study, trials),
+        benchmark=None if benchmark is None else _benchmark(benchmark),
         n_importances=N_IMPORTANCES,
         machines=analysis.readable("machines", machines) if len(machines) else None,
         begun=min((_minute(trial.datetime_start) for trial in trials if trial.datetime_start), default=""),
@@ -213,6 +220,29 @@ def _taught(study: Study, trials: Sequence[FrozenTrial]) -> dict[str, Any] | Non
         "patterns": _picture(patterns_plot({study.study_name: table})),
         "rankings": rankings,
     }
+
+
+def _benchmark(folder: Path) -> dict[str, Any]:
+    """The tables of a benchmark and its learning curves."""
+    runs = tables.read_runs(folder)
+    number = tables.closest_table(runs["variant"])
+    runs = tables.in_order(runs, number)
+    comparison = tables.compare(runs, number)
+    shown = tables.statistics_tables(tables.interquartile_means(runs), tables.improvements(runs))
+    return {
+        "folder": folder,
+        "number": number if comparison["paper_mean"].notna().any() else None,
+        "tables": [(str(table.title), _frame(table)) for table in (*tables.score_tables(comparison), *shown)],
+        "missing": tables.missing(runs),
+        "curves": _picture(learning_curves_plot(read_curves(folder))),
+    }
+
+
+def _frame(table: Table) -> pd.DataFrame:
+    """A table of the terminal, for the page."""
+    columns = [[Text.from_markup(str(cell)).plain for cell in column.cells] for column in table.columns]
+    headings = [Text.from_markup(str(column.header)).plain for column in table.columns]
+    return pd.DataFrame(zip(*columns, strict=True), columns=headings)
 
 
 def _picture(figure: Figure) -> str:
@@ -285,7 +315,7 @@ code { font: .82rem/1.35 ui-monospace, "DejaVu Sans Mono", monospace; color: #55
 .loss { line-height: 1.7; }
 .lead { font-size: 1.05rem; }
 figure { margin: 1rem 0; }
-figure img { width: 100%; }
+figure img { max-width: 100%; }
 figcaption, .note { color: #555; font-size: .92rem; }
 h3 { font-size: 1.05rem; margin: 1.6rem 0 .4rem; }
 .wide { overflow-x: auto; }
@@ -437,11 +467,27 @@ with and without the token.</p>
 <h2>Would other metrics choose other losses?</h2>
 {% if taught.rankings %}
 <figure><img src="{{ taught.rankings }}" alt="Learning curves of the best candidates under three metrics">
-<figcaption>Learning curves of the best candidates under three metrics (the paper's figure 10).</figcaption></figure>
+<figcaption>Learning curves of the best candidates under three metrics (the paper's figure 10): AULC, the return at the first
+checkpoint, the return at the last one.</figcaption></figure>
 {{ table(taught.tables.rank_agreement) }}
 {% else %}
 <p>{{ taught.problems.rankings }}.</p>
 {% endif %}
+{% endif %}
+{% if benchmark %}
+<h2>Benchmark</h2>
+<p>Mean and deviation over the seeds, as measured in {{ benchmark.folder }}.
+{% if benchmark.number %}Beside them the paper's table {{ benchmark.number }}; ▲ ▼: they differ by more than two standard
+errors of the difference.{% endif %}</p>
+{% for line in benchmark.missing %}
+<p><strong>{{ line }}</strong></p>
+{% endfor %}
+{% for title, frame in benchmark.tables %}
+<h3>{{ title }}</h3>
+{{ table(frame) }}
+{% endfor %}
+<figure><img src="{{ benchmark.curves }}" alt="Learning curves of the benchmark">
+<figcaption>Learning curves over the seeds (the paper's figure 9).</figcaption></figure>
 {% endif %}
 {% if machines is not none %}
 <h2>Machines and time</h2>

@@ -1,0 +1,214 @@
+"""aarl analyze, aarl figures and what the report says of a benchmark: from planted studies and runs, as a user calls them."""
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import lxml.html
+import numpy as np
+import optuna
+import pytest
+import scipy.stats
+from optuna.trial import TrialState, create_trial
+from typer.testing import CliRunner
+
+from sb3_aarl.callbacks import Evaluation, write_curve
+from search.benchmark import read_curves
+from search.cli import app
+from search.space import distributions, loss_to_params, random_loss
+from search.storage import open_storage
+
+runner = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"})
+FIGURES = ("evolution", "histogram", "rankings", "patterns")
+
+
+def run(*arguments: object, fails: bool = False) -> str:
+    result = runner.invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == (2 if fails else 0), result.stderr
+    return result.stderr if fails else result.stdout
+
+
+def plant(where: str, name: str, seed: int) -> optuna.Study:
+    """60 candidates, better with s_t in the source, and a failed one; and two baselines."""
+    rng = np.random.default_rng(seed)
+    storage = open_storage(where)
+    study = optuna.create_study(study_name=name, storage=storage, direction="maximize")
+    for i in range(60):
+        loss = random_loss(rng, 2)
+        score = float(rng.normal(100, 5) + 50 * loss.source[0])
+        curve = [[1000, score - 10.0, 1.0], [2000, score + 10.0, 1.0]]
+        attrs = {"stage": 1 + i // 30, "operation": "random", "curve": curve, "device": "CPU: some", "threads": 2}
+        params, space = loss_to_params(loss), distributions(loss.horizon)
+        study.add_trial(create_trial(value=score, params=params, distributions=space, user_attrs=attrs))
+    study.add_trial(create_trial(state=TrialState.FAIL))
+    baselines = optuna.create_study(study_name=f"{name}-baselines", storage=storage, direction="maximize")
+    for variant, score in (("SAC", 90.0), ("SAC", 91.0), ("CURL $x_{", 120.0)):
+        attrs = {"variant": variant, "environment": "x", "seed": int(score), "curve": [[1, score, 0.0]]}
+        baselines.add_trial(create_trial(value=score, user_attrs=attrs))
+    return study
+
+
+@pytest.fixture
+def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> optuna.Study:
+    """The only search in runs/."""
+    monkeypatch.chdir(tmp_path)
+    return plant("runs/one", "one", 0)
+
+
+@pytest.fixture
+def benchmark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two variants, two seeds, two tasks; the last run has not begun."""
+    monkeypatch.chdir(tmp_path)
+    folder = Path("runs/benchmark")
+    for i, (variant, task, seed) in enumerate((v, t, s) for v in "ab" for t in ("walker-walk", "X-v0") for s in (0, 1)):
+        path = folder / variant / task / f"seed-{seed}"
+        path.mkdir(parents=True)
+        environment = f"dm_control/{task}-v0" if task == "walker-walk" else task
+        about = {"variant": variant, "environment": environment, "seed": seed, "checkpoints": [2000], "sessions": []}
+        (path / "provenance.json").write_text(json.dumps(about))
+        if i < 7:
+            write_curve(path / "curve.csv", [Evaluation(1000 * j, 10.0 * i + j, 0.5, 5, 1.0) for j in (1, 2)])
+    (folder / "journal.log").touch()
+    return folder
+
+
+def texts(picture: Path) -> str:
+    """All that is written in an SVG: matplotlib leaves it beside the outlines of its letters."""
+    return "\n".join(re.findall(r"<!-- (.*?) -->", picture.read_text(encoding="utf-8"), flags=re.DOTALL))
+
+
+def test_analyze_writes_all_tables_as_data(study: optuna.Study) -> None:
+    run("analyze", "--json", "all.json", "--csv", "tables", "--pattern", "{s_t} -> {r_t}")
+    data = json.loads(Path("all.json").read_text())["one"]
+    done = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
+    for name, (source, target) in {"{s_t} -> {r_t}": ("s_t", "r_t"), "State reconstruction": ("s_t", "s_t")}.items():
+        classes: dict[bool, list[float]] = {True: [], False: []}
+        for trial in done:
+            has = trial.params[f"source/{source}"] and trial.params[f"target/{target}"]
+            classes[bool(has)].append(trial.value)
+        row = next(row for row in data["table5"] if row["pattern"] == name)
+        assert row["difference"] == pytest.approx(np.mean(classes[True]) - np.mean(classes[False]), rel=1e-9)
+        welch = scipy.stats.ttest_ind(classes[True], classes[False], equal_var=False).pvalue
+        assert row["welch_p"] == pytest.approx(welch, rel=1e-9)
+        assert (row["n_with"], row["n_without"]) == (len(classes[True]), len(classes[False]))
+    assert {row["state"]: row["trials"] for row in data["population"]} == {
+        **dict.fromkeys(("pruned", "running", "waiting", "unusable"), 0),
+        **{"trials": 61, "analysed": 60, "fail": 1},
+    }
+    assert data["importances"][0]["parameter"] == "source/s_t"
+    best = max(done, key=lambda trial: trial.value)
+    assert [row["number"] for row in data["lineage"]] == [best.number]
+    assert all(row["spearman"] == pytest.approx(1.0) for row in data["rank_agreement"])
+    assert data["problems"] == {} and data["machines"][0]["device"] == "CPU: some"
+    tables = {path.name: list(csv.DictReader(path.open())) for path in Path("tables").iterdir()}
+    assert {f"one-{name}.csv" for name in data} - {"one-problems.csv"} == set(tables)
+    for row, same in zip(tables["one-table5.csv"], data["table5"], strict=True):
+        assert row["pattern"] == same["pattern"] and float(row["welch_p"]) == pytest.approx(same["welch_p"])
+
+
+def test_analyze_shows_whole_numbers_in_a_narrow_terminal(study: optuna.Study) -> None:
+    run("analyze", "--json", "all.json")
+    data = json.loads(Path("all.json").read_text())["one"]
+    shown = run("analyze", "runs/one")
+    for row in data["table5"]:
+        difference = re.escape(f"{row['difference']:+.2f}") + r"\*{0,2} "
+        p_values = rf"\W+{row['welch_p']:.2g}\W+{row['student_p']:.2g} "
+        assert re.search(rf"{row['pattern']} \W+{difference}{p_values}", shown)
+    assert "…" not in shown and re.search(r"fail +│ +1 ", shown)
+
+
+def test_analyze_compares_studies(study: optuna.Study) -> None:
+    plant("sqlite:///more.db", "two", 1)
+    plant("sqlite:///more.db", "three", 2)
+    shown = run("analyze", "--storage", "sqlite:///more.db", "--study", "three", "--study", "two").splitlines()
+    layout = shown[next(i for i, line in enumerate(shown) if "as the paper's table 5" in line) :]
+    assert [line.split()[1] for line in layout if re.match("│ (two|three)", line)] == ["three", "two"]
+    plant("elsewhere/one", "one", 3)
+    shown = "\n".join(run("analyze", "runs/one", "elsewhere/one").splitlines())
+    assert "│ runs/one " in shown and "│ elsewhere/one " in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["analyze", "nowhere"], "nowhere/journal.log does not exist"),
+        (["analyze", "--study", "other"], "no study 'other': the storage has one, one-baselines"),
+        (["analyze", "runs/one", "runs/one", "--study", "one"], "there are 2 folders"),
+        (["analyze", "runs/one", "runs/one"], "named twice: one, one"),
+        (["analyze", "--pattern", "{s_t}"], "{s_t}"),
+        (["figures", "patterns", "--pattern", "curll"], "nearest: curl"),
+        (["figures", "evolution", "--out", "x.txt"], "x.txt: figures are written as"),
+        (["figures", "curves"], "runs/benchmark has no learning curves"),
+        (["figures", "rankings", "--study", "one-baselines"], "no complete trial has a learning curve"),
+    ],
+    ids=["folder", "study", "folders", "twice", "pattern", "name", "kind", "benchmark", "curves"],
+)
+def test_what_cannot_be_shown_is_one_line(study: optuna.Study, arguments: list[str], message: str) -> None:
+    error = run(*arguments, fails=True)
+    assert message in error and len(error.strip().splitlines()) == 1
+    assert not list(Path().glob("*.txt"))
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figures_of_a_search(study: optuna.Study, name: str) -> None:
+    assert run("figures", name) == f"Figure: runs/one/{name}.png\n"
+    assert Path(f"runs/one/{name}.png").read_bytes().startswith(b"\x89PNG")
+    run("figures", name, "runs/one", "--out", "deep/figure.svg")
+    written = texts(Path("deep/figure.svg"))
+    assert "60 candidates (left out: 1 failed)" in written
+    if name == "evolution":
+        assert "SAC" in written and "CURL $x_{" in written
+    if name == "patterns":
+        run("figures", name, "--pattern", "{s_t} -> {r_t}", "--ties-without", "--out", "own.svg")
+        assert "{s_t} -&gt; {r_t}" in texts(Path("own.svg")).replace(">", "&gt;")
+
+
+def test_figures_of_several_searches(study: optuna.Study) -> None:
+    plant("runs/two", "two", 1)
+    for name in ("evolution", "histogram", "patterns"):
+        run("figures", name, "runs/one", "runs/two", "--out", f"{name}.svg")
+        written = texts(Path(f"{name}.svg"))
+        assert all(re.search(rf"\b{title}\b", written) for title in ("one", "two"))
+
+
+def test_curves_of_a_benchmark(benchmark: Path) -> None:
+    frame = read_curves(benchmark)
+    assert set(frame["env"]) == {"walker-walk", "X-v0"} and len(frame) == 14
+    first = frame.query("variant == 'b' and env == 'walker-walk' and seed == 0 and environment_steps == 2000")
+    assert first["mean"].tolist() == [42.0] and first["std"].tolist() == [0.5]
+    output = run("figures", "curves", "--out", "curves.svg")
+    assert "Missing at 2,000: b on X-v0, seed 1: not begun" in output
+    written = texts(Path("curves.svg"))
+    assert "walker-walk" in written and "a: 2 seeds, b: 1 seed (shade:" in written
+    run("figures", "curves", benchmark, "--smooth", "2")
+    assert (benchmark / "curves.png").exists()
+    (benchmark / "b/X-v0/seed-0/curve.csv").write_text("a,b\n1,2\n")
+    assert "b/X-v0/seed-0 is not what a benchmark leaves" in run("figures", "curves", fails=True)
+
+
+def test_a_benchmark_is_no_search_but_part_of_a_report(study: optuna.Study, benchmark: Path) -> None:
+    assert "is a benchmark, no search" in run("report", benchmark, fails=True)
+    assert "is a benchmark, no search" in run("figures", "evolution", benchmark, fails=True)
+    # The search is the only one in runs/.
+    assert run("report", "--benchmark", "runs/benchmark") == "Report: runs/one/report.html\n"
+    page = lxml.html.parse("runs/one/report.html").getroot()
+    table = page.xpath("//h3[starts-with(., '2K steps')]/following::table[1]")[0]
+    rows = [[cell.text_content() for cell in row.xpath("./td")] for row in table.xpath(".//tr[td]")]
+    # Runs 0, 1 and 4, 5 are walker-walk's, 2, 3 and 6 the other's; each gives 10 i + 2.
+    assert rows == [["X-v0", "27.0 ± 7.1", "62.0 (1/2)"], ["walker-walk", "7 ± 7", "47 ± 7"]]
+    text = " ".join(page.text_content().split())
+    assert "Missing at 2,000: b on X-v0, seed 1: not begun" in text and "CURL $x_{" in text
+    assert len(page.xpath("//figure/img[starts-with(@src, 'data:image/svg+xml;base64,')]")) == 3
+
+
+def test_the_help_needs_nothing_heavy() -> None:
+    program = (
+        "import sys; from typer.testing import CliRunner; from search.cli import app; "
+        "[CliRunner().invoke(app, [*of, '--help']) for of in ([], ['figures'], ['analyze'])]; "
+        "print([name for name in ('torch', 'optuna', 'pandas', 'matplotlib', 'plotly') if name in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
