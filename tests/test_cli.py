@@ -147,6 +147,20 @@ def test_the_default_file_of_hyperparameters_is_there_and_belongs_to_what_is_ins
     assert installed == {path for path in there if "__pycache__" not in path.parts}
 
 
+def test_the_files_of_the_readme_are_what_it_says(folder: Path) -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"`(\w+\.yml)`:\n\n```yaml\n(.*?)```", readme, flags=re.DOTALL)
+    assert [name for name, _ in blocks] == ["own.yml", "pendulum.yml"]
+    for name, text in blocks:
+        (folder / name).write_text(text)
+    config = load_config("pendulum.yml")
+    assert config.environment == "Pendulum-v1" and config.hyperparameters_for("Pendulum-v1")["batch_size"] == 128
+    assert config.hyperparameters_for("HalfCheetah-v5")["env_kwargs"] == {"action_repeat": 2}
+    # Every command that it names is there.
+    for command in re.findall(r"^    aarl (figures [\w-]+|[\w-]+)", readme, flags=re.MULTILINE):
+        assert runner.invoke(app, [*command.split(), "--help"]).exit_code == 0, command
+
+
 @pytest.mark.parametrize("run", ["runs/some", "elsewhere/some.yml"])
 def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(run: str, monkeypatch: pytest.MonkeyPatch) -> None:
     optuna.create_study(study_name="some", storage=open_storage("runs/some"))
