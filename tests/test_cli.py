@@ -255,6 +255,8 @@ def test_a_baseline_that_diverges_does_not_hide_the_others(folder: Path) -> None
     states = Counter((trial.user_attrs["variant"], trial.state) for trial in study.trials)
     assert states == {("SAC", TrialState.COMPLETE): 1, ("Diverges", TrialState.FAIL): MAX_TRIES}
     assert f"{study.best_value:.3f}" in result.stdout
+    # What a report counts hours by.
+    assert all(t.user_attrs["device"].startswith(("CPU: ", "GPU: ")) and t.user_attrs["threads"] >= 1 for t in study.trials)
     reason = [trial.user_attrs["reason"] for trial in study.trials if trial.state == TrialState.FAIL][-1]
     assert "nan" in reason
     assert result.stderr.splitlines() == [f"Failed: Diverges on dm_control/cartpole-balance-v0, seed 0: {reason}"]
