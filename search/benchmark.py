@@ -35,7 +35,7 @@ class Benchmark:
     Variants x environments x seeds, as ``grid.run`` trains them.
 
     :param files: Files of hyper-parameters by variant
-    :param hyperparameters: What they say, by variant and environment
+    :param hyperparameters: What they say, by variant and environment; each has an ``aux_loss``
     :param checkpoints: Environment steps by environment, ascending: what is compared; the last one ends the training
     :param seeds: Seeds of the trainings
     :param every: Environment steps after which it is also evaluated, None for at the checkpoints only
@@ -91,7 +91,7 @@ class Benchmark:
             "evaluations": self.evaluations(cell.environment),
             "evaluation_episodes": self.evaluation_episodes,
             "file": self.files[cell.variant],
-            "hyperparameters": {"aux_loss": "auto", **settings},
+            "hyperparameters": dict(settings),
             "sessions": [],
         }
 
@@ -106,7 +106,7 @@ class Benchmark:
         :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
         """
         settings = dict(self.hyperparameters[cell.variant][cell.environment])
-        loss = settings.pop("aux_loss", "auto")
+        loss = settings.pop("aux_loss")
         path = run_folder(folder, cell)
         about = self.about(cell)
         # A run that was killed and goes on has several.
@@ -175,7 +175,10 @@ def load_benchmark(
         raise ConfigError(f"every must be at least 1, not {every}")
     ids = [resolve_env_id(name) for name in environments] or _common_environments(files)
     ids = list(dict.fromkeys(ids))
-    hyperparameters = {path.stem: {name: load_hyperparameters(path, name) for name in ids} for path in files}
+    # SACAux's default, written out: a file that says nothing is not one that says none.
+    hyperparameters = {
+        path.stem: {name: {"aux_loss": "auto", **load_hyperparameters(path, name)} for name in ids} for path in files
+    }
     of_environment = {name: _checkpoints(name, hyperparameters, checkpoints) for name in ids}
     paths = {path.stem: str(path) for path in files}
     benchmark = Benchmark(paths, hyperparameters, of_environment, seeds, every, evaluation_episodes)

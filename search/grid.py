@@ -27,6 +27,8 @@ MAX_TRIES = 3
 POLL_SECONDS = 1.0
 # User attribute of a study: what decides the scores, by what is trained.
 TRAINING_KEY = "training"
+# Settings that change no score.
+SCORELESS = ("n_timesteps", "device")
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,13 @@ class Variant:
 
     aux_loss: AuxLoss | None
     overrides: Mapping[str, Any] = field(default_factory=dict)
+
+
+class _Default:
+    """In the place of a setting that is not there: null may be another one."""
+
+    def __repr__(self) -> str:
+        return "default"
 
 
 class Cell(NamedTuple):
@@ -147,15 +156,16 @@ def check_training(study: optuna.Study, trainings: Mapping[str, Mapping[str, Any
     :raises ValueError: naming the first setting that differs
     """
     study_id(study)  # now, before several workers do
-    trainings = json.loads(json.dumps(trainings))
+    trainings, default = json.loads(json.dumps(trainings)), _Default()
     begun = study.user_attrs.get(TRAINING_KEY, {})
     for name, settings in trainings.items():
         before = begun.setdefault(name, settings)
         for key in settings | before:
-            if before.get(key) != settings.get(key) and key not in ("n_timesteps", "device"):  # these change no score
+            old, new = before.get(key, default), settings.get(key, default)
+            if old != new and key not in SCORELESS:
                 raise ValueError(
-                    f"study {study.study_name!r} was begun with {key}={before.get(key)!r}, not {settings.get(key)!r} "
-                    f"({name}): another search needs a file of another name, another benchmark a folder of its own"
+                    f"study {study.study_name!r} was begun with {key}={old!r}, not {new!r} ({name}): another search needs "
+                    "a file of another name, another benchmark a folder of its own"
                 )
     if begun != study.user_attrs.get(TRAINING_KEY):
         study.set_user_attr(TRAINING_KEY, begun)

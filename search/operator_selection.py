@@ -34,13 +34,14 @@ def table(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The paper's table 2: mean and standard deviation of normalized returns over all environments and seeds.
 
-    The paper does not say how returns are normalized. Here each is divided by the mean of all operators on its
-    environment, so that environments count alike, and then all by the best operator's mean, so that this is 1.
+    The paper does not say how returns are normalized. Here each is divided by the size of the mean of all operators on
+    its environment, so that environments count alike and higher is better even if returns are negative, and then all by
+    the best operator's mean, so that this is 1; unless it is negative.
 
     :param runs: As :func:`search.grid.scores` gives them; ``last`` is the return at the last checkpoint
     :return: One row an operator: ``mean``, ``std``, ``runs``, the best first
     """
-    scale = runs.groupby("environment")["last"].transform("mean")
+    scale = runs.groupby("environment")["last"].transform("mean").abs()
     normalized = (runs["last"] / scale.where(scale != 0, 1.0)).groupby(runs["variant"])
     result = pd.DataFrame({"mean": normalized.mean(), "std": normalized.std(ddof=0), "runs": normalized.count()})
     best = result["mean"].max()

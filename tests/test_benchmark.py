@@ -124,6 +124,28 @@ def test_evaluations_in_between_are_no_checkpoints(folder: Path) -> None:
     assert benchmark.about(benchmark.cells[0])["checkpoints"] == [120, 300]
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        ("none", None, "aux_loss=None, not 'auto'"),
+        (None, "none", "aux_loss='auto', not None"),
+        (None, "aarl-state", "aux_loss='auto', not 'aarl-state'"),
+    ],
+    ids=str,
+)
+def test_a_file_that_says_nothing_of_a_loss_is_not_one_that_says_none(
+    first: str | None, second: str | None, message: str, folder: Path
+) -> None:
+    line = '  aux_loss: "{s_t, a_t} -> {s_t+1}"\n'
+    for loss in (first, second):
+        (folder / "mine.yml").write_text(MINE.replace(line, "" if loss is None else f"  aux_loss: {loss}\n"))
+        benchmark = load_benchmark([folder / "mine.yml"], seeds=[0], checkpoints=[300])
+        if loss is first:
+            benchmark.prepare(folder)
+    with pytest.raises(ValueError, match=re.escape(f"{message} (mine on Pendulum-v1)")):
+        benchmark.prepare(folder)
+
+
 CHECKPOINT = 300
 
 

@@ -12,7 +12,7 @@ import pytest
 from optuna.trial import TrialState
 
 from sb3_aarl import catalog
-from search import evolve, grid, workers
+from search import evolve, grid, operator_selection, workers
 from search.config import CrossValidation, SearchConfig
 from search.storage import load_study, open_storage
 
@@ -139,6 +139,28 @@ def test_variants_are_compared_that_have_all_runs_that_any_has() -> None:
     assert grid.comparable(runs[:0]).empty
 
 
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        # Mean of both -600, -200: each divided by that, its sign kept.
+        ({"a": [-300.0, -100.0], "b": [-900.0, -300.0]}, {"a": (-0.5, 0.0), "b": (-1.5, 0.0)}),
+        # 200 and -600: a is 0.5 and -0.5, b 1.5 and -1.5.
+        ({"a": [100.0, -300.0], "b": [300.0, -900.0]}, {"a": (0.0, 0.5), "b": (0.0, 1.5)}),
+        ({"a": [100.0, 30.0], "b": [300.0, 90.0]}, {"b": (1.0, 0.0), "a": (1 / 3, 0.0)}),
+        ({"a": [0.0, 0.0], "b": [0.0, 0.0]}, {"a": (0.0, 0.0), "b": (0.0, 0.0)}),
+    ],
+    ids=["negative", "both signs", "positive", "zero"],
+)
+def test_normalized_returns_rank_the_higher_one_first(
+    returns: dict[str, list[float]], expected: dict[str, tuple[float, float]]
+) -> None:
+    rows = [(variant, task, last) for variant, of in returns.items() for task, last in zip("xy", of, strict=True)]
+    table = operator_selection.table(pd.DataFrame(rows, columns=["variant", "environment", "last"]))
+    assert list(table.index) == list(expected)
+    for variant, numbers in expected.items():
+        assert tuple(table.loc[variant, ["mean", "std"]]) == pytest.approx(numbers)
+
+
 def test_scores_are_those_of_the_runs_asked_for(tmp_path: Path) -> None:
     study = make_study(tmp_path)
     (cell,) = GRID.cells
@@ -197,9 +219,10 @@ def with_checkpoints(*checkpoints: int) -> SearchConfig:
 @pytest.mark.parametrize(
     ("changed", "name"),
     [
-        ({"variants": {"SAC": grid.Variant(None, {"gamma": 0.9})}}, r"gamma=None, not 0\.9 \(SAC\)"),
+        ({"variants": {"SAC": grid.Variant(None, {"gamma": 0.9})}}, r"gamma=default, not 0\.9 \(SAC\)"),
         ({"variants": {"CURL": grid.Variant(catalog.load("curl"), {"gamma": 0.5})}}, r"gamma=0\.9, not 0\.5 \(CURL\)"),
         ({"variants": {"CURL": grid.Variant(None, {"gamma": 0.9})}}, r"aux_loss=.*, not None \(CURL\)"),
+        ({"variants": {"CURL": grid.Variant(catalog.load("curl"))}}, r"gamma=0\.9, not default \(CURL\)"),
         ({"config": with_checkpoints(400, 1600)}, rf"checkpoints=\[400, 1200\], not \[400, 1600\] \({OTHER}\)"),
         ({"config": replace(CONFIG, evaluation_episodes=3)}, "evaluation_episodes=10, not 3"),
         ({"config": replace(CONFIG, overrides={"batch_size": 16})}, "batch_size=64, not 16"),
