@@ -150,6 +150,25 @@ def test_rl_zoo_reads_the_same(variant: str) -> None:
         assert entry == load_hyperparameters(path, env_id), env_id
 
 
+# All text that there is but environments and files; RL-Zoo would take any other for text too.
+WORDS = {"MlpPolicy", "CnnPolicy", "auto_0.1", "none", "random_crop", "aarl-state", "aarl-pixel", "curl", *encoders.ENCODERS}
+BASELINES = {"SAC", "CURL", "SAC (no aug)", "SAC-Identity", "SAC-DenseMLP", "CURL-DenseMLP"}
+
+
+def texts(value: Any) -> list[str]:
+    """The text in nested values, keys left out."""
+    values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [value] if isinstance(value, str) else [text for item in values for text in texts(item)]
+
+
+@pytest.mark.parametrize("path", sorted(ZOO.rglob("*.yml")), ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_no_number_is_text_to_plain_yaml(path: Path) -> None:
+    """YAML 1.1 reads 1e-3 as text, and so does RL-Zoo."""
+    found = set(texts(yaml.safe_load(path.read_text())))
+    known = WORDS | set(env_ids()) | BASELINES
+    assert {text for text in found - known if not (path.parent / text).is_file()} == set()
+
+
 @functools.cache
 def shared_env(env_id: str, env_kwargs: tuple[tuple[str, Any], ...]) -> gym.Env:
     """One environment for all variants that see the same: making them is slow."""
