@@ -1,5 +1,6 @@
 """What a search teaches about auxiliary losses (paper, section 3.3, B.2, B.3): pure functions of a table of trials."""
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -378,6 +379,9 @@ def rankings(table: pd.DataFrame) -> pd.DataFrame:
                 f"trial {number} was evaluated at {_steps(steps)} environment steps, trial {reference[0]} at "
                 f"{_steps(reference[1])}: their learning curves cannot be compared"
             )
+    for number, curve in zip(trials["number"], trials["curve"], strict=True):
+        if not all(math.isfinite(mean) for _, mean, _ in curve):
+            raise ValueError(f"the learning curve of trial {number} has a return that is not finite: it cannot be ranked")
     result = trials[["number", "loss", "curve"]].copy()
     returns = trials["curve"].map(lambda curve: [mean for _, mean, _ in curve])
     result["aulc"] = returns.map(np.mean).astype(float)

@@ -333,8 +333,10 @@ def benchmark(
 
         names = [name.strip() for name in envs.split(",")] if envs else []
         steps = parse_steps(checkpoints) if checkpoints else ()
-        (between,) = parse_steps(every) if every else (None,)
-        grid = load_benchmark(configs, names, parse_seeds(seeds), steps, between, episodes)
+        between = parse_steps(every) if every else (None,)
+        if len(between) != 1:
+            raise ValueError(f"--every is one number of environment steps, not {every}")
+        grid = load_benchmark(configs, names, parse_seeds(seeds), steps, between[0], episodes)
         grid.prepare(out)
         _, failures = _train_grid(grid, out, None, workers, threads)
         note_failures(out, failures)

@@ -354,9 +354,9 @@ def learning_curves_plot(curves: pd.DataFrame, smooth: int = 1) -> Figure:
             if not n_seeds:
                 continue
             points = runs.groupby("environment_steps").agg(
-                n=("mean", "size"),
+                n=("mean", "count"),
                 mean=("mean", "mean"),
-                over_seeds=("mean", lambda of: of.std(ddof=0)),
+                over_seeds=("mean", "std"),
                 episodes=("std", "mean"),
             )
             points = points[points["n"] == n_seeds]

@@ -329,7 +329,7 @@ def test_learning_curves_are_means_and_deviations_over_seeds(curves):
             assert len(whole) == (12 if variant == "curl" else 15)
             np.testing.assert_array_equal(line.get_xdata(), whole.index)
             np.testing.assert_allclose(line.get_ydata(), whole.mean(axis=1))
-            spread = whole.to_numpy().std(axis=1) if whole.shape[1] > 1 else np.full(len(whole), 7.0)
+            spread = whole.to_numpy().std(axis=1, ddof=1) if whole.shape[1] > 1 else np.full(len(whole), 7.0)
             outline = shade.get_paths()[0].vertices
             for step, mean, deviation in zip(whole.index, whole.mean(axis=1), spread, strict=True):
                 at_step = outline[np.isclose(outline[:, 0], step), 1]
