@@ -25,8 +25,11 @@ from search.config import VEC_ENVS, load_aux_loss, load_hyperparameters, resolve
 
 logger = logging.getLogger(__name__)
 
-# Far from the training seeds: evaluations do not begin where trainings did.
+# Evaluations begin neither where trainings did nor where those of another run do: the evaluations of a run have this many
+# seeds, from this one on. Below the half of the seeds that numpy knows; trainings that go on have the other.
 EVALUATION_SEED = 10_000
+EVALUATION_SEEDS = 1_000_000
+HALF = 2**31
 
 
 class TrainingError(RuntimeError):
@@ -149,7 +152,7 @@ def train_candidate(
                         eval_env,
                         checkpoints,
                         evaluation_episodes,
-                        seed=EVALUATION_SEED + seed,
+                        seed=(EVALUATION_SEED + EVALUATION_SEEDS * seed) % HALF,
                         path=None if store is None else store.curve_path,
                         on_evaluation=on_evaluation,
                         curve=curve,
@@ -298,7 +301,7 @@ class _RunFolder:
                 # Not the initial states of the beginning again.
                 vec_env = model.get_env()
                 assert vec_env is not None
-                vec_env.seed(self.seed + model.num_timesteps)
+                vec_env.seed(HALF + (self.seed + model.num_timesteps) % HALF)
                 logger.info("Training goes on after %d environment steps", curve[-1].environment_steps)
                 return model, curve
         self.remove_checkpoint()

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -80,17 +80,20 @@ for failure in ("raise", "memory", "interrupt", "diverge"):
 
 
 class Counting(gym.Env):
-    """Episodes of 10 steps; counts the steps of all its environments."""
+    """Episodes of 10 steps; counts the steps of all its environments, and notes their seeds."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
     steps = 0
+    seeds: ClassVar[list[int]] = []
 
     def __init__(self, render_mode: str | None = None):
         pass
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
+        if seed is not None:
+            Counting.seeds.append(seed)
         self.left = 10
         return np.zeros(2, np.float32), {}
 
@@ -134,7 +137,7 @@ def test_the_curve_is_that_of_a_plain_training(tmp_path: Path) -> None:
     model = SACAux("MlpPolicy", make_dmc_env(ENV, action_repeat=40, seed=3), aux_loss=LOSS, seed=3, **settings)
     env_kwargs = {"env_id": ENV, "action_repeat": 40}
     eval_env = make_vec_env(make_dmc_env, 2, seed=0, wrapper_class=SingleEpisodes, env_kwargs=env_kwargs)
-    curve = LearningCurveCallback(eval_env, CHECKPOINTS, 2, seed=10_003)
+    curve = LearningCurveCallback(eval_env, CHECKPOINTS, 2, seed=3_010_000)
     model.learn(60, curve)
     assert [point[:4] for point in run.curve] == [point[:4] for point in curve.curve]
     assert run.aulc == pytest.approx(np.mean([point.mean for point in curve.curve]))
@@ -340,6 +343,34 @@ def test_a_killed_training_goes_on_from_its_checkpoint(killed: Path, tmp_path: P
     assert [point.environment_steps for point in run.curve] == list(CHECKPOINTS)
     assert all(later.seconds > earlier.seconds for earlier, later in zip(run.curve, run.curve[1:], strict=False))
     assert not (folder / "checkpoint").exists()
+
+
+def test_no_two_trainings_and_evaluations_begin_alike(tmp_path: Path) -> None:
+    def seeds_of(loss: AuxLoss | None, seed: int) -> tuple[list[int], set[int]]:
+        """Those of the training, before and after an interruption, and those of its evaluations."""
+
+        def stop(evaluation: Evaluation) -> None:
+            if evaluation.environment_steps == 40:
+                raise KeyboardInterrupt
+
+        Counting.seeds.clear()
+        arguments = ("Counting-v0", loss, HYPER | {"env_kwargs": {}}, seed, [20, 40, 60], 3, tmp_path / f"{loss} {seed}")
+        with pytest.raises(KeyboardInterrupt):
+            train_candidate(*arguments, stop)
+        n_before = len(Counting.seeds)
+        train_candidate(*arguments)
+        of_training = [Counting.seeds[0], Counting.seeds[n_before]]
+        return of_training, {*Counting.seeds} - {*of_training}
+
+    runs = [0, 1, 2, 9_990, 2**32 - 1]  # numpy's largest
+    trained, evaluated = zip(*(seeds_of(LOSS, seed) for seed in runs), strict=True)
+    assert all(len(seeds) == 9 for seeds in evaluated) and len(set.union(*evaluated)) == 9 * len(runs)
+    assert [of_training[0] for of_training in trained] == runs
+    assert all(2**31 <= of_training[1] < 2**32 for of_training in trained) and len({second for _, second in trained}) == len(
+        runs
+    )
+    assert max(set.union(*evaluated)) < 2**31  # and never those of trainings that go on, however long
+    assert seeds_of(None, 1)[1] == evaluated[1]  # equal for all losses
 
 
 def truncate(name: str) -> Callable[[Path], None]:
