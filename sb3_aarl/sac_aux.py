@@ -508,9 +508,9 @@ class SACAux(SAC):
     def _update_target(self) -> None:
         # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.
         if self.tau > 0:
-            polyak_update(self._q_parameters(self.critic), self._q_parameters(self.critic_target), self.tau)
+            _moving_average(self._q_parameters(self.critic_target), self._q_parameters(self.critic), self.tau)
             encoder, momentum_encoder = self.critic.features_extractor, self.critic_target.features_extractor
-            polyak_update(encoder.parameters(), momentum_encoder.parameters(), self.encoder_tau)
+            _moving_average(momentum_encoder.parameters(), encoder.parameters(), self.encoder_tau)
         # Running means of batch norm are copied, see SB3's issue 996.
         polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
@@ -682,3 +682,12 @@ class SACAux(SAC):
         if self.aux_head is not None:
             state_dicts = [*state_dicts, "aux_head", "aux_optimizer"]
         return state_dicts, variables
+
+
+@th.no_grad()
+def _moving_average(averages: Iterable[th.Tensor], parameters: Iterable[th.Tensor], tau: float) -> None:
+    """SB3's ``polyak_update``, to the bit, with two kernels for all parameters together where there is a GPU."""
+    moved, towards = list(averages), list(parameters)
+    if moved:
+        th._foreach_mul_(moved, 1 - tau)
+        th._foreach_add_(moved, towards, alpha=tau)
