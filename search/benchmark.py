@@ -16,7 +16,7 @@ from sb3_aarl import catalog
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search.config import ConfigError, load_hyperparameters, named_environments, resolve_env_id
-from search.grid import Cell, check_training
+from search.grid import SCORELESS, Cell, check_training
 from search.objective import end_noted, mean_curve
 from search.provenance import provenance
 from search.storage import open_storage
@@ -128,7 +128,8 @@ class Benchmark:
 
     def prepare(self, folder: Path) -> None:
         """
-        Leave in each run's folder what is asked for: a table can say what is missing.
+        Leave in each run's folder what is asked for: a table can say what is missing. Runs that are there and were evaluated
+        at the same steps get the checkpoints of now.
 
         :param folder: Folder of the benchmark
         :raises ValueError: when runs that are there were trained in another way
@@ -142,6 +143,10 @@ class Benchmark:
             path = run_folder(folder, cell)
             if not (path / ABOUT).exists():
                 _write_about(path, self.about(cell))
+        for path, about in read_abouts(folder)[0].items():
+            environment = about["environment"]
+            if environment in self.checkpoints and about.get("evaluations") == self.evaluations(environment):
+                _write_about(path, {**about, "checkpoints": list(self.checkpoints[environment])})
 
 
 def load_benchmark(
@@ -211,6 +216,37 @@ def task_name(environment: str) -> str:
     return environment.removeprefix(PREFIX).removesuffix("-v0") if environment.startswith(PREFIX) else environment
 
 
+def read_abouts(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[Path]]:
+    """
+    What stands beside the curves of a benchmark's runs.
+
+    :param folder: Folder of a benchmark; runs that were copied there from another machine count too
+    :return: What does, by the runs' folders, and the folders where it cannot be read
+    :raises ValueError: naming two folders that have the same run, or runs of a variant on an environment that were trained
+        in different ways
+    """
+    abouts: dict[Path, dict[str, Any]] = {}
+    unreadable: list[Path] = []
+    of_cell: dict[Cell, Path] = {}
+    trained: dict[tuple[str, str], Path] = {}
+    for path in sorted(file.parent for file in folder.glob(f"*/*/*/{ABOUT}")):
+        about = _read_about(path)
+        if not {*Cell._fields, "checkpoints", "sessions"} <= about.keys():
+            unreadable.append(path)
+            continue
+        abouts[path] = about
+        cell = Cell(*(about[name] for name in Cell._fields))
+        other = of_cell.setdefault(cell, path)
+        if other != path:
+            raise ValueError(f"{other} and {path} have the same run: {cell.variant} on {cell.environment}, seed {cell.seed}")
+        other = trained.setdefault((cell.variant, cell.environment), path)
+        old, new = _training(abouts[other]), _training(about)
+        for key in old | new:
+            if old.get(key) != new.get(key):
+                raise ValueError(f"{other} and {path} cannot be compared: {key}={old.get(key)!r} and {new.get(key)!r}")
+    return abouts, unreadable
+
+
 def read_curves(folder: Path) -> pd.DataFrame:
     """
     The learning curves of a benchmark's runs, as ``plots.learning_curves_plot`` takes them: one row an evaluation with
@@ -221,15 +257,14 @@ def read_curves(folder: Path) -> pd.DataFrame:
     :raises ValueError: when no run has a learning curve, or naming one that cannot be read
     """
     rows = []
-    for path in sorted(folder.glob(f"*/*/*/{ABOUT}")):
-        curve = path.with_name("curve.csv")
+    for path, about in read_abouts(folder)[0].items():
+        curve = path / "curve.csv"
         if curve.exists():
             try:
-                about = _read_about(path.parent)
                 run = (about["variant"], task_name(about["environment"]), about["seed"])
                 rows += [(*run, point.environment_steps, point.mean, point.std) for point in read_curve(curve)]
             except (ValueError, KeyError, TypeError) as error:
-                raise ValueError(f"{path.parent} is not what a benchmark leaves: {type(error).__name__}: {error}") from None
+                raise ValueError(f"{path} is not what a benchmark leaves: {type(error).__name__}: {error}") from None
     if not rows:
         raise ValueError(f"{folder} has no learning curves of a benchmark")
     return pd.DataFrame(rows, columns=["variant", "env", "seed", "environment_steps", "mean", "std"])
@@ -308,11 +343,19 @@ def _checkpoints(
     return tuple(step for step in CHECKPOINTS if step <= budget)
 
 
+def _training(about: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides a run's scores."""
+    settings = {"evaluation_episodes": about.get("evaluation_episodes"), **about.get("hyperparameters", {})}
+    return {key: value for key, value in settings.items() if key not in SCORELESS}
+
+
 def _read_about(path: Path) -> dict[str, Any]:
+    """What stands in a run's folder; nothing if it is not there, or torn."""
     try:
-        return json.loads((path / ABOUT).read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        about = json.loads((path / ABOUT).read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
         return {}
+    return about if isinstance(about, dict) else {}
 
 
 def _write_about(path: Path, about: Mapping[str, Any]) -> None:

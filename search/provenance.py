@@ -1,5 +1,6 @@
 """Where a number comes from: commit, versions, machine and command, as plain values for JSON and notes."""
 
+import hashlib
 import os
 import platform
 import subprocess
@@ -16,14 +17,19 @@ PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "
 
 
 def commit() -> str:
-    """The commit of this checkout, with ``+changes`` if files differ from it; the version where there is no checkout."""
+    """
+    The commit of this checkout, with ``+changes.`` and a hash of them if files differ from it; the version where there is
+    no checkout.
+    """
     root = Path(__file__).parent.parent
 
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+    def git(*arguments: str) -> bytes:
+        return subprocess.run(["git", *arguments], cwd=root, capture_output=True, check=True).stdout.strip()
 
     try:
-        return git("rev-parse", "--short=12", "HEAD") + ("+changes" if git("status", "--porcelain", "-uno") else "")
+        changes = git("diff", "--no-ext-diff", "HEAD")
+        digest = f"+changes.{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
+        return git("rev-parse", "--short=12", "HEAD").decode() + digest
     except (OSError, subprocess.CalledProcessError):
         return metadata.version("sb3-aarl")
 

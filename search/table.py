@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from scipy import stats
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search import operator_selection
-from search.benchmark import ABOUT, task_name
+from search.benchmark import ABOUT, read_abouts, task_name
 from search.grid import comparable
 
 # Resamples of the bootstrap.
@@ -75,29 +76,40 @@ def read_runs(folder: Path) -> pd.DataFrame:
     """
     What a benchmark's folder has: one row for each checkpoint of each run that was asked for, with ``variant``,
     ``environment``, ``seed``, ``checkpoint`` (environment steps), ``mean`` (return; NaN if it is missing), ``reason`` (why it
-    is missing, else empty) and ``commit`` (of all sessions that trained it).
+    is missing, else empty), ``commit`` and ``versions`` (of all sessions that trained it).
 
     :param folder: Folder of a benchmark; runs that were copied there from another machine count too
-    :raises ValueError: when there are none
+    :raises ValueError: when there are none, when one cannot be read, and as :func:`search.benchmark.read_abouts` does
     """
-    rows = []
-    for path in sorted(folder.glob(f"*/*/*/{ABOUT}")):
+    rows: list[tuple[Any, ...]] = []
+    abouts, unreadable = read_abouts(folder)
+    for path, about in abouts.items():
         try:
-            rows += _points(path)
+            rows += _points(path, about)
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path.parent} is not what a benchmark leaves: {type(error).__name__}: {error}") from None
+            raise ValueError(f"{path} is not what a benchmark leaves: {type(error).__name__}: {error}") from None
+    of_task = {path.parent.name: about for path, about in abouts.items()}
+    for path in unreadable:
+        # What its folder says, and the other runs on its task: it is not passed over in silence.
+        task, seed = path.parent.name, path.name.removeprefix("seed-")
+        if task not in of_task or not seed.isdecimal():
+            raise ValueError(f"{path} is not what a benchmark leaves: {ABOUT} cannot be read")
+        run = (path.parent.parent.name, of_task[task]["environment"], int(seed))
+        reason = f"its {ABOUT} cannot be read"
+        rows += [(*run, checkpoint, math.nan, reason, "", "") for checkpoint in of_task[task]["checkpoints"]]
     if not rows:
         raise ValueError(f"{folder} has no runs of a benchmark")
-    columns = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit"]
+    columns = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions"]
     return pd.DataFrame(rows, columns=columns)
 
 
-def _points(path: Path) -> list[tuple[Any, ...]]:
+def _points(path: Path, about: dict[str, Any]) -> list[tuple[Any, ...]]:
     """The rows of one run."""
-    about = json.loads(path.read_text(encoding="utf-8"))
-    curve = path.with_name("curve.csv")
+    curve = path / "curve.csv"
     points = {point.environment_steps: point.mean for point in read_curve(curve)} if curve.exists() else {}
     commits = ", ".join(dict.fromkeys(session["commit"] for session in about["sessions"]))
+    packages = [session["versions"].split(", ") for session in about["sessions"] if "versions" in session]
+    versions = ", ".join(dict.fromkeys(chain.from_iterable(packages)))
     rows = []
     for checkpoint in about["checkpoints"]:
         mean = points.get(checkpoint, math.nan)
@@ -109,7 +121,7 @@ def _points(path: Path) -> list[tuple[Any, ...]]:
             begun = f"unfinished, evaluated up to {max(points, default=0):,}" if about["sessions"] else "not begun"
             reason = about.get("failed", begun)
         run = (about["variant"], about["environment"], about["seed"])
-        rows.append((*run, checkpoint, math.nan if reason else mean, reason, commits))
+        rows.append((*run, checkpoint, math.nan if reason else mean, reason, commits, versions))
     return rows
 
 
@@ -140,7 +152,8 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
 
     For table 6 the returns are normalized as for table 2, see :func:`search.operator_selection.table`: the paper says for
     neither how. N is 5 seeds x 6 environments there. Both deviations then have the difference of the environments in them,
-    which makes the test a cautious one.
+    which makes the test a cautious one. What the returns are normalized by are the variants that are complete: if these are
+    not the paper's four, no number of the paper stands beside them.
 
     :param runs: As :func:`read_runs` gives them
     :param number: 3, 4 or 6, None for no table of the paper
@@ -159,6 +172,9 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
         names = dict(zip(paper["variant"], paper["column"], strict=True))
     numbers = dict.fromkeys(columns[-3:], float)
     result = result.merge(paper.drop(columns="column").astype(numbers), on=keys, how="left")
+    for _, part in result.groupby("checkpoint"):
+        if not _is_comparable(part):
+            result.loc[part.index, list(numbers)] = math.nan
     result["column"] = [names.get(variant, variant) for variant in result["variant"]]
     result["difference"] = result["mean"] - result["paper_mean"]
     variance = result["std"] ** 2 / result["runs"] + result["paper_std"] ** 2 / result["paper_runs"]
@@ -166,6 +182,13 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     far = result["difference"].abs() > STANDARD_ERRORS * result["standard_error"]
     result["mark"] = np.where(far, np.where(result["difference"] > 0, "higher", "lower"), "")
     return result[[*keys, "asked", "runs", "mean", "std", *columns[3:], "difference", "standard_error", "mark"]]
+
+
+def _is_comparable(comparison: pd.DataFrame) -> bool:
+    """Whether the scores of a checkpoint can be compared with the paper's: not if they are normalized by other variants."""
+    of_paper = set(_paper()[6]["columns"].values())
+    is_normalized = (comparison["environment"] == NORMALIZED).any()
+    return not is_normalized or set(comparison.dropna(subset="mean")["variant"]) == of_paper
 
 
 def _by_task(runs: pd.DataFrame) -> pd.DataFrame:
@@ -292,12 +315,16 @@ def missing(runs: pd.DataFrame) -> list[str]:
 
 def commits(runs: pd.DataFrame) -> dict[str, int]:
     """
-    How many runs were trained with which commits.
+    How many runs were trained with which commits, and with which versions of packages of which there are several. A run
+    that went on with another one counts for both.
 
     :param runs: As :func:`read_runs` gives them
     """
-    of_runs = runs[runs["commit"] != ""].drop_duplicates(["variant", "environment", "seed"])["commit"]
-    return {str(commit): int(count) for commit, count in of_runs.value_counts().items()}
+    of_runs = runs.drop_duplicates(["variant", "environment", "seed"])
+    counts = of_runs["commit"].str.split(", ").explode().value_counts()
+    versions = of_runs["versions"].str.split(", ").explode().value_counts()
+    several = versions[versions.index.str.split(" ").str[0].duplicated(keep=False)]
+    return {str(name): int(count) for name, count in pd.concat([counts, several]).items() if name}
 
 
 def score_tables(comparison: pd.DataFrame) -> list[Table]:
@@ -308,7 +335,8 @@ def score_tables(comparison: pd.DataFrame) -> list[Table]:
     """
     tables = []
     for checkpoint, part in comparison.groupby("checkpoint"):
-        table = Table("", title=f"{_steps(checkpoint)} steps scores")
+        others = "" if _is_comparable(part) else ", without the paper's: normalized by other variants than its four"
+        table = Table("", title=f"{_steps(checkpoint)} steps scores{others}")
         headings = dict(zip(part["variant"], part["column"], strict=True))
         in_paper = set(part.dropna(subset="paper_mean")["variant"])
         for variant, heading in headings.items():

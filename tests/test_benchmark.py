@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss
 from sb3_aarl.callbacks import read_curve
-from search import grid, table
+from search import grid, provenance, table
 from search.benchmark import ABOUT, Benchmark, load_benchmark, parse_seeds, parse_steps, run_folder
 from search.cli import app
 from search.config import load_hyperparameters
@@ -118,6 +118,18 @@ def test_what_cannot_be_benchmarked_is_refused_before_anything_is_made(options: 
     assert not Path("runs").exists()
 
 
+def test_other_checkpoints_of_the_same_evaluations_are_those_of_all_runs(folder: Path) -> None:
+    files = [folder / "mine.yml", folder / "plain.yml"]
+    load_benchmark(files, checkpoints=[100, 300], every=100, seeds=[0, 1]).prepare(folder)
+    begun = run_folder(folder, Cell("mine", "Pendulum-v1", 0)) / ABOUT
+    begun.write_text(json.dumps({**json.loads(begun.read_text()), "sessions": [{"commit": "c0ffee"}], "seconds": 3.0}))
+    load_benchmark(files[:1], checkpoints=[200, 300], every=100, seeds=[0]).prepare(folder)
+    runs = table.read_runs(folder)
+    assert len(runs) == 8 and set(runs["checkpoint"]) == {200, 300}
+    about = json.loads(begun.read_text())
+    assert about["evaluations"] == [100, 200, 300] and about["seconds"] == 3.0 and about["sessions"] == [{"commit": "c0ffee"}]
+
+
 def test_evaluations_in_between_are_no_checkpoints(folder: Path) -> None:
     benchmark = load_benchmark([folder / "mine.yml"], checkpoints=[120, 300], every=100)
     assert benchmark.evaluations("Pendulum-v1") == [100, 120, 200, 300]
@@ -144,6 +156,20 @@ def test_a_file_that_says_nothing_of_a_loss_is_not_one_that_says_none(
             benchmark.prepare(folder)
     with pytest.raises(ValueError, match=re.escape(f"{message} (mine on Pendulum-v1)")):
         benchmark.prepare(folder)
+
+
+def test_two_sets_of_changes_are_two_commits(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "search").mkdir()
+    monkeypatch.setattr(provenance, "__file__", str(folder / "search" / "provenance.py"))
+    for command in ("init", "add mine.yml", "-c user.name=me -c user.email=me@here commit -m first"):
+        subprocess.run(["git", *command.split()], check=True, capture_output=True)
+    commits = [provenance.commit()]
+    for text in ("one", "two\xe9", "one"):
+        (folder / "mine.yml").write_text(text, encoding="latin-1")
+        commits.append(provenance.commit())
+    clean, one, two, again = commits
+    assert re.fullmatch("[0-9a-f]{12}", clean) and one == again != two
+    assert all(re.fullmatch(rf"{clean}\+changes\.[0-9a-f]{{8}}", commit) for commit in (one, two))
 
 
 CHECKPOINT = 300
@@ -191,7 +217,7 @@ def test_killed_and_gone_on_with_it_is_what_it_would_have_been(folder: Path) -> 
         assert about["hyperparameters"] == {**load_hyperparameters(about["file"], cell.environment)}
         assert about["seconds"] == float(row["seconds"]) > 0
         assert {"commit", "command", "date", "cpu", "gpu", "python", "versions"} <= set(about["sessions"][-1])
-        assert re.fullmatch(r"[0-9a-f]{12}(\+changes)?", about["sessions"][-1]["commit"])
+        assert re.fullmatch(r"[0-9a-f]{12}(\+changes\.[0-9a-f]{8})?", about["sessions"][-1]["commit"])
     assert " ".join(command).removeprefix("benchmark") in json.loads(first.read_text())["sessions"][0]["command"]
 
     for variant in ("mine", "plain"):

@@ -3,6 +3,8 @@
 import itertools
 import json
 import math
+import re
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -257,23 +259,41 @@ def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
     returns = {
         "aarl_state": {CHEETAH: [400.0, 480.0], WALKER: [900.0, 910.0]},
         "aarl_mlp_1": {CHEETAH: [390.0, 410.0], WALKER: [700.0, 850.0]},
+        "aarl_dense_mlp_4": {CHEETAH: [390.0, 400.0], WALKER: [650.0, 800.0]},
         "aarl_mlp_4": {CHEETAH: [100.0, 150.0], WALKER: [300.0]},  # a run is missing
     }
     plant_scores(tmp_path, {(v, e): np.array(scores) for v, of in returns.items() for e, scores in of.items()})
     plant(tmp_path, Cell("aarl_mlp_4", WALKER, 1), {}, failed="it burst")
     result = table.compare(table.read_runs(tmp_path), 6).set_index("variant")
-    complete = ("aarl_state", "aarl_mlp_1")
+    complete = ("aarl_state", "aarl_mlp_1", "aarl_dense_mlp_4")
     scale = {env: np.mean([returns[variant][env] for variant in complete]) for env in (CHEETAH, WALKER)}
     relative = {v: np.concatenate([np.array(returns[v][env]) / scale[env] for env in scale]) for v in complete}
     best = max(scores.mean() for scores in relative.values())
     for variant, scores in relative.items():
         row = result.loc[variant]
         assert (row["mean"], row["std"]) == pytest.approx((scores.mean() / best, scores.std(ddof=1) / best))
-        assert (row["environment"], row["asked"], row["runs"], row["paper_runs"]) == ("normalized", 4, 4, 30)
-    assert result.loc["aarl_state", "mean"] == 1.0 == result.loc["aarl_state", "paper_mean"]
+        assert (row["environment"], row["asked"], row["runs"]) == ("normalized", 4, 4)
+    assert result.loc["aarl_state", "mean"] == 1.0
     assert math.isnan(result.loc["aarl_mlp_4", "mean"]) and tuple(result.loc["aarl_mlp_4", ["asked", "runs"]]) == (4, 3)
-    shown = runner.invoke(app, ["table", str(tmp_path)])
-    assert "1.000 ± 0.129" in shown.stdout and "aarl_mlp_4 on walker-walk, seed 1: it burst" in shown.stdout
+    # Normalized by others than the paper's four: no number of the paper, no mark, and why.
+    assert result[["paper_mean", "paper_std", "paper_runs", "difference"]].isna().all(axis=None) and set(result["mark"]) == {
+        ""
+    }
+    shown = " ".join(runner.invoke(app, ["table", str(tmp_path)]).stdout.split())
+    assert "100K steps scores, without the paper's: normalized by other variants than its four" in shown
+    assert "1.000 ± 0.12" not in shown and "aarl_mlp_4 on walker-walk, seed 1: it burst" in shown
+
+    path = run_folder(tmp_path, Cell("aarl_mlp_4", WALKER, 1))
+    write_curve(path / "curve.csv", [Evaluation(100_000, 310.0, 1.0, 10, 2.0)])
+    result = table.compare(table.read_runs(tmp_path), 6).set_index("variant")
+    assert list(result["paper_runs"]) == [30] * 4 and result.loc["aarl_state", "paper_mean"] == 1.0 == result["mean"].max()
+    shown = " ".join(runner.invoke(app, ["table", str(tmp_path)]).stdout.split())
+    assert "1.000 ± 0.129" in shown and "without the paper's" not in shown
+    plant(tmp_path, Cell("mine", CHEETAH, 0), {100_000: 900.0}, sessions=[])
+    assert table.compare(table.read_runs(tmp_path), 6)["paper_mean"].count() == 4  # not complete: it normalizes nothing
+    for cell in (Cell("mine", CHEETAH, 1), Cell("mine", WALKER, 0), Cell("mine", WALKER, 1)):
+        plant(tmp_path, cell, {100_000: 900.0})
+    assert table.compare(table.read_runs(tmp_path), 6)["paper_mean"].count() == 0
 
 
 def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
@@ -306,10 +326,65 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
         "Missing at 500,000: mine on cheetah-run, seed 0: unfinished, evaluated up to 0",
     ]
     assert json.loads((tmp_path / "data.json").read_text())["missing"] == lines
-    assert "Runs of several commits: c0ffee (9); c0ffee, beef (1)" in shown.stdout
+    assert "Runs of several commits: c0ffee (10); beef (1)" in shown.stdout
     iqm = table.interquartile_means(table.read_runs(tmp_path)).set_index(["checkpoint", "variant"])
     assert list(iqm.loc[100_000].index) == ["aarl_state", "sac_identity"]  # what has no run hides no others
     assert tuple(iqm.loc[(100_000, "aarl_state"), ["asked", "runs"]]) == (8, 4) and "│ 4/8" in shown.stdout
+
+
+def test_commits_and_versions_that_differ_are_counted_by_run(tmp_path: Path) -> None:
+    old, new = ("torch 2.12, mujoco 3.17", "torch 2.13, mujoco 3.17")
+    plant(tmp_path, Cell("a", CHEETAH, 0), {100_000: 1.0}, sessions=[{"commit": "c0ffee", "versions": old}])
+    assert table.commits(table.read_runs(tmp_path)) == {"c0ffee": 1}
+    sessions = [{"commit": "c0ffee", "versions": old}, {"commit": "c0ffee", "versions": new}]
+    plant(tmp_path, Cell("a", CHEETAH, 1), {100_000: 1.0}, sessions=sessions)
+    plant(tmp_path, Cell("a", CHEETAH, 2), {}, sessions=[])
+    assert table.commits(table.read_runs(tmp_path)) == {"c0ffee": 2, "torch 2.12": 2, "torch 2.13": 1}
+
+
+def test_a_run_that_is_there_twice_is_refused_with_both_folders(tmp_path: Path) -> None:
+    cell = Cell("a", CHEETAH, 0)
+    plant(tmp_path, cell, {100_000: 1.0})
+    first, copied = run_folder(tmp_path, cell), run_folder(tmp_path, cell._replace(seed=9))
+    shutil.copytree(first, copied)
+    for command in (["table"], ["figures", "curves"]):
+        result = runner.invoke(app, [*command, str(tmp_path)])
+        message = f"Error: {first} and {copied} have the same run: a on {CHEETAH}, seed 0"
+        assert result.exit_code == 2 and result.stderr == f"{message}\n"
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"hyperparameters": {"aux_loss": "auto", "gamma": 0.9}}, "gamma=0.5 and 0.9"),
+        ({"hyperparameters": {"aux_loss": None, "gamma": 0.5}}, "aux_loss='auto' and None"),
+        ({"evaluation_episodes": 1}, "evaluation_episodes=10 and 1"),
+        ({"hyperparameters": {"aux_loss": "auto", "gamma": 0.5, "n_timesteps": 9, "device": "cuda"}}, None),
+    ],
+    ids=str,
+)
+def test_seeds_that_were_trained_in_different_ways_are_refused(
+    changed: dict[str, Any], message: str | None, tmp_path: Path
+) -> None:
+    settings = {"hyperparameters": {"aux_loss": "auto", "gamma": 0.5}, "evaluation_episodes": 10}
+    cells = [Cell("a", CHEETAH, 0), Cell("a", CHEETAH, 1), Cell("a", WALKER, 0), Cell("b", CHEETAH, 0)]
+    for cell in cells:  # other variants and tasks have their own
+        plant(tmp_path, cell, {100_000: 1.0}, **(settings if cell == cells[0] else settings | changed))
+    if message is None:
+        assert len(table.read_runs(tmp_path)) == 4
+    else:
+        first, second = (run_folder(tmp_path, cell) for cell in cells[:2])
+        with pytest.raises(ValueError, match=re.escape(f"{first} and {second} cannot be compared: {message}")):
+            table.read_runs(tmp_path)
+
+
+def test_a_run_with_a_torn_description_is_missing(tmp_path: Path) -> None:
+    for seed in range(2):
+        plant(tmp_path, Cell("a", CHEETAH, seed), {100_000: 1.0})
+    (run_folder(tmp_path, Cell("a", CHEETAH, 1)) / ABOUT).write_text('{"variant": "a", "envir')
+    result = runner.invoke(app, ["table", str(tmp_path)])
+    assert result.exit_code == 0 and "1 (1/2)" in result.stdout
+    assert f"Missing at 100,000: a on cheetah-run, seed 1: its {ABOUT} cannot be read" in result.stdout
 
 
 def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) -> None:
