@@ -20,6 +20,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.encoders import encoder_class
 from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env, wrap_env
 from sb3_aarl.policies import SACAuxPolicy
 
@@ -438,8 +439,16 @@ def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str)
     if checked.get("aux_loss") not in (None, "auto"):
         _convert(values["aux_loss"], AuxLoss, f"{where}: aux_loss", Path())
         checked["aux_loss"] = None if values["aux_loss"] == "none" else values["aux_loss"]
-    if checked.get("n_envs", 1) < 1:
-        raise ConfigError(f"{where}: n_envs must be at least 1, not {checked['n_envs']}")
+    for key, number in (
+        ("n_envs", checked.get("n_envs")),
+        ("action_repeat", (checked.get("env_kwargs") or {}).get("action_repeat")),
+    ):
+        if number is not None and number < 1:
+            raise ConfigError(f"{where}: {key} must be at least 1, not {number}")
+    try:
+        encoder_class((checked.get("policy_kwargs") or {}).get("features_extractor_class", "identity"))
+    except ValueError as error:
+        raise ConfigError(f"{where}: policy_kwargs: {error}") from None
     if checked.get("vec_env", "dummy") not in VEC_ENVS:
         raise ConfigError(f"{where}: vec_env must be one of {', '.join(VEC_ENVS)}, not {checked['vec_env']!r}")
     return checked
@@ -487,7 +496,6 @@ def _check(config: SearchConfig, where: str) -> None:
             for overrides in ({}, *(baseline.overrides for baseline in baselines)):
                 settings = config.hyperparameters_for(env_id, overrides)
                 repeat = settings.get("env_kwargs", {}).get("action_repeat", 1)
-                check(repeat > 0, f"action_repeat must be at least 1, not {repeat}")
                 steps = list(config.checkpoints_for(env_id))
                 ascending = bool(steps) and sorted(set(steps)) == steps and steps[0] > 0
                 check(ascending, f"checkpoints must be positive environment steps in ascending order, not {steps} ({env_id})")

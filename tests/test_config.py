@@ -256,6 +256,11 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"overrides": {"seed": 3}}, "unknown key 'seed'"),
     ({"overrides": {"n_envs": 0}}, "n_envs must be at least 1, not 0"),
     ({"overrides": {"n_envs": 1.5}}, "n_envs must be an integer"),
+    ({"overrides": {"env_kwargs": {"action_repeat": 0}}}, "overrides: action_repeat must be at least 1, not 0"),
+    (
+        {"overrides": {"policy_kwargs": {"features_extractor_class": "dens_mlp"}}},
+        "overrides: .*unknown encoder 'dens_mlp'.*dense_mlp",
+    ),
     ({"overrides": {"vec_env": "threads"}}, "vec_env must be one of dummy, subproc, not 'threads'"),
     ({"environment": 3}, "environment must be text, not 3"),
     ({"environment": "dm_control/cheetah-rum-v0"}, "cheetah-run"),
