@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import optuna
 import pandas as pd
 
@@ -20,7 +21,7 @@ from search.grid import SCORELESS, Cell, check_training
 from search.objective import end_noted, mean_curve
 from search.provenance import provenance
 from search.storage import open_storage
-from search.training import train_candidate
+from search.training import make_env, train_candidate
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
@@ -180,6 +181,8 @@ def load_benchmark(
         raise ConfigError(f"every must be at least 1, not {every}")
     ids = [resolve_env_id(name) for name in environments] or _common_environments(files)
     ids = list(dict.fromkeys(ids))
+    for name in ids:
+        _check_actions(name)
     # SACAux's default, written out: a file that says nothing is not one that says none.
     hyperparameters = {
         path.stem: {name: {"aux_loss": "auto", **load_hyperparameters(path, name)} for name in ids} for path in files
@@ -321,6 +324,19 @@ def _common_environments(files: Iterable[Path]) -> list[str]:
     if not common:
         raise ConfigError("the files have no entry of one environment in common: name environments")
     return [resolve_env_id(name) for name in common]
+
+
+def _check_actions(environment: str) -> None:
+    """Refuse an environment that cannot be made, or whose actions are not continuous. Those of DeepMind Control all are."""
+    if environment.startswith(PREFIX):
+        return
+    try:
+        env = make_env(environment, {})
+    except Exception as error:  # whatever an environment of somebody's own does
+        raise ConfigError(f"{environment} cannot be made: {type(error).__name__}: {' '.join(str(error).split())}") from None
+    with env:
+        if not isinstance(env.action_space, gym.spaces.Box):
+            raise ConfigError(f"{environment} has no continuous actions, which SACAux needs, but {env.action_space}")
 
 
 def _action_repeat(settings: Mapping[str, Any]) -> int:

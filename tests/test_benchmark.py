@@ -95,6 +95,7 @@ def test_without_options_the_zoo_makes_the_papers_tables(number: int, variants: 
         ("mine.yml default.yml", "no entry of one environment in common: name environments"),
         ("mine.yml --envs Pendulm-v1", "unknown environment 'Pendulm-v1', nearest: Pendulum-v1"),
         ("mine.yml --envs Hopper-v5", "mine.yml: neither 'Hopper-v5' nor 'default' is there"),
+        ("default.yml --envs CartPole-v1", "CartPole-v1 has no continuous actions, which SACAux needs, but Discrete(2)"),
         ("mine.yml", "n_timesteps ends the training on Pendulum-v1 at 300 environment steps: name checkpoints"),
         (
             "mine.yml --checkpoints 300,200",
