@@ -10,8 +10,10 @@ Everything after the program's name is RL-Zoo's: see ``python -m sb3_aarl.rl_zoo
 """
 
 import argparse
+import ast
 import functools
 import importlib
+import reprlib
 import runpy
 import sys
 from collections.abc import Sequence
@@ -74,10 +76,22 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
         with open(path, encoding="utf-8") as file:
             entries = yaml.safe_load(file)
         env_kwargs = entries.get(known.env, entries.get("default", {})).get("env_kwargs", {})
-        values = [f"{key}:{value!r}" for key, value in env_kwargs.items()]
-    except (OSError, yaml.YAMLError, AttributeError) as error:
+        values = [_as_python(key, value) for key, value in env_kwargs.items()]
+    except (OSError, yaml.YAMLError, AttributeError, ValueError) as error:
         parser.error(f"{path} is no file of hyper-parameters: {error}")
     return [*arguments, "--env-kwargs", *values, *known.env_kwargs] if values else list(arguments)
+
+
+def _as_python(key: Any, value: Any) -> str:
+    """For RL-Zoo, which evaluates what stands behind the colon: nothing that does more than to be a value."""
+    text = repr(value)
+    try:
+        is_plain = isinstance(key, str) and key.isidentifier() and ast.literal_eval(text) == value
+    except (ValueError, SyntaxError, RecursionError):
+        is_plain = False
+    if not is_plain:
+        raise ValueError(f"env_kwargs are arguments with plain values, not {reprlib.repr(key)}: {reprlib.repr(value)}")
+    return f"{key}:{text}"
 
 
 def main() -> None:

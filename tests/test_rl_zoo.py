@@ -110,6 +110,31 @@ def test_what_is_not_ours_stays(arguments: list[str]) -> None:
     assert with_env_kwargs(arguments) == arguments
 
 
+@pytest.mark.parametrize(
+    "env_kwargs",
+    [
+        """{"action_repeat:__import__('os').system('touch executed')or 2#": 1}""",
+        "{action repeat: 1}",
+        "{'': 1}",
+        "{1: 1}",
+        "{action_repeat: 2020-01-01}",
+        "{action_repeat: .inf}",
+    ],
+)
+def test_what_rl_zoo_would_evaluate_is_refused(env_kwargs: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.yml").write_text(f"default: {{env_kwargs: {env_kwargs}}}")
+    with pytest.raises(SystemExit):
+        with_env_kwargs([*SAC_AUX, "-conf", str(tmp_path / "own.yml")])
+    assert "env_kwargs are arguments with plain values, not" in capsys.readouterr().err
+
+
+def test_plain_values_reach_rl_zoo_as_they_are(tmp_path: Path) -> None:
+    values = "{a: 1, b: [1, -2.5, null], c: {d: true}, e: 'x: __import__(1)#', f: \"'quoted'\"}"
+    (tmp_path / "own.yml").write_text(f"default: {{env_kwargs: {values}}}")
+    arguments = with_env_kwargs([*SAC_AUX, "-conf", str(tmp_path / "own.yml")])
+    assert added(arguments) == {"a": 1, "b": [1, -2.5, None], "c": {"d": True}, "e": "x: __import__(1)#", "f": "'quoted'"}
+
+
 def test_one_error_for_a_file_that_is_missing_or_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "list.yml").write_text("[1, 2]")
     (tmp_path / "torn.yml").write_text("{a: b")
