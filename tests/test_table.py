@@ -326,7 +326,7 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
         "Missing at 500,000: mine on cheetah-run, seed 0: unfinished, evaluated up to 0",
     ]
     assert json.loads((tmp_path / "data.json").read_text())["missing"] == lines
-    assert "Runs of several commits: c0ffee (10); beef (1)" in shown.stdout
+    assert "Runs of several commits or versions: c0ffee (10); beef (1)" in shown.stdout
     iqm = table.interquartile_means(table.read_runs(tmp_path)).set_index(["checkpoint", "variant"])
     assert list(iqm.loc[100_000].index) == ["aarl_state", "sac_identity"]  # what has no run hides no others
     assert tuple(iqm.loc[(100_000, "aarl_state"), ["asked", "runs"]]) == (8, 4) and "│ 4/8" in shown.stdout
