@@ -14,6 +14,7 @@ import pytest
 import yaml
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState
+from rich.console import Console
 from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss, SACAux, catalog
@@ -215,7 +216,10 @@ def add_runs(grid: Grid, scores: dict[str, float], fails: Callable[[Cell], bool]
             study.add_trial(optuna.trial.create_trial(value=score, user_attrs=attributes))
 
 
-def test_a_cross_validation_with_a_failed_run_ranks_the_others_and_says_so(cross_validation: Grid) -> None:
+def test_a_cross_validation_with_a_failed_run_ranks_the_others_and_says_so(
+    cross_validation: Grid, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("search.cli.console", Console(width=200))  # a narrow one would break lines
     worst, middle, best = map(str, LOSSES)
     failed = Cell(best, "dm_control/reacher-easy-v0", 1)
     add_runs(cross_validation, {worst: 1.0, middle: 2.0, best: 3.0}, lambda cell: cell == failed)
