@@ -387,7 +387,8 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
     commits = tables.commits(runs)
     if len(commits) > 1:
         of_each = "; ".join(f"{commit} ({count})" for commit, count in commits.items())
-        console.print(f"Runs of several commits or versions: {of_each}", style="red", markup=False, soft_wrap=True, highlight=False)
+        notice = f"Runs of several commits or versions: {of_each}"
+        console.print(notice, style="red", markup=False, soft_wrap=True, highlight=False)
 
 
 def _show_missing(runs: "pd.DataFrame") -> None:
