@@ -4,6 +4,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 import traceback
@@ -26,6 +27,7 @@ def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, 
     import torch as th
 
     signal.signal(signal.SIGINT, _interrupt_once)
+    sys.unraisablehook = _interrupt_again
     th.set_num_threads(threads)
     threading.Thread(target=_stop_with_parent, args=(os.getppid(),), daemon=True).start()
     try:
@@ -49,6 +51,15 @@ def _interrupt_once(signum: int, frame: Any) -> None:
     if not _shielded:
         raise KeyboardInterrupt
     _shielded[-1] = True
+
+
+def _interrupt_again(unraisable: Any) -> None:
+    """An interruption that fell into a destructor or a weak reference's callback, where exceptions are lost, is repeated."""
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
+        return
+    _interrupted.clear()
+    threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
 
 
 _shielded: list[bool] = []

@@ -46,6 +46,36 @@ def test_a_second_interrupt_does_not_disturb_a_worker_that_puts_away_what_it_has
     assert worker.exitcode == 128 + signal.SIGINT
 
 
+class Slow:
+    """Something that takes a while to go away."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def __del__(self) -> None:
+        (self.folder / "going").touch()
+        time.sleep(20)
+
+
+def lets_go(folder: Path) -> None:
+    Slow(folder)
+    (folder / "gone").touch()
+    while True:
+        time.sleep(0.01)
+
+
+def test_an_interrupt_in_a_destructor_is_not_lost(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with WorkerPool(lets_go, (tmp_path,), n_workers=1) as pool:
+        (worker,) = pool.processes
+        wait_for(tmp_path / "going")
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGINT)
+        worker.join(10)
+        assert worker.exitcode == 128 + signal.SIGINT
+    assert (tmp_path / "gone").exists()  # Python went on behind the destructor that the first one broke off
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def write_threads(folder: Path) -> None:
     """A worker that says how many threads it has."""
     (folder / "threads").write_text(f"{th.get_num_threads()} {os.environ['OMP_NUM_THREADS']}")
