@@ -14,7 +14,6 @@ each round.
 
 import argparse
 import functools
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -34,7 +33,7 @@ from sb3_aarl import SACAux
 from sb3_aarl.callbacks import LearningCurveCallback, SingleEpisodes
 from sb3_aarl.envs import make_dmc_env
 from search.config import VEC_ENVS
-from search.provenance import provenance
+from search.provenance import save_result
 
 ACTION_REPEAT = 4
 EPISODES = 10
@@ -189,8 +188,7 @@ def main() -> None:
     rows += measure_evaluation(args.pixel_task, True, ways, args.rounds, args.pixel_steps)
     show(rows)
     if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps({**provenance(), "threads": th.get_num_threads(), "rows": rows}, indent=1) + "\n")
+        save_result(args.out, threads=th.get_num_threads(), rows=rows)
 
 
 if __name__ == "__main__":

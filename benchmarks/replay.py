@@ -7,7 +7,6 @@ observations. SB3's buffer gives as many as 256 transitions, whole. Both draw fr
 
 import argparse
 import gc
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -23,7 +22,7 @@ from rich.table import Table
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_aarl.buffers import WindowReplayBuffer
-from search.provenance import provenance
+from search.provenance import save_result
 
 IMAGES = spaces.Box(0, 255, (9, 100, 100), np.uint8)
 ACTIONS = spaces.Box(-1, 1, (6,), np.float32)
@@ -104,9 +103,7 @@ def main() -> None:
         table.add_row(name, f"{row['ms']:.2f}", f"{row['observations_per_second']:,.0f}", f"{row['times_sb3']:.2f}", size)
     Console().print(table)
     if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        result = {**provenance(), "transitions": args.transitions, "rows": rows}
-        args.out.write_text(json.dumps(result, indent=1) + "\n")
+        save_result(args.out, transitions=args.transitions, rows=rows)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import optuna
 from scipy.stats import mannwhitneyu
 
 from sb3_aarl.aux_loss import AuxLoss, Token
-from search.provenance import provenance
+from search.provenance import save_result
 from search.sampler import AuxLossSampler
 from search.space import MAX_HORIZON, random_loss, suggest_aux_loss
 
@@ -245,8 +245,7 @@ def main() -> None:
     done.sort(key=lambda cell: (cell["objective"], cell["sampler"], cell["seed"]))
     tables = report(done)
     if args.out:
-        result = {**provenance(), "evaluations": args.evaluations, "tables": tables, "cells": done}
-        args.out.write_text(json.dumps(result, indent=1) + "\n")
+        save_result(args.out, evaluations=args.evaluations, tables=tables, cells=done)
 
 
 if __name__ == "__main__":

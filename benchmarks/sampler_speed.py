@@ -6,7 +6,6 @@ whole stages pass: the first asks of a stage, with the choice of parents and the
 """
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import optuna
 from optuna.samplers import BaseSampler, NSGAIISampler
 
-from search.provenance import provenance
+from search.provenance import save_result
 from search.sampler import AuxLossSampler
 from search.space import suggest_aux_loss
 
@@ -69,8 +68,7 @@ def main() -> None:
             print(f"{name:16} {row['finished']:8} {row['median_ms']:11.2f} {row['max_ms']:8.2f}", end="")
             print(f"{row['cpu_median_ms']:30.2f} {row['cpu_max_ms']:8.2f}", flush=True)
     if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps({**provenance(), "asks": args.asks, "tables": tables}, indent=1) + "\n")
+        save_result(args.out, asks=args.asks, tables=tables)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 
 from search import workers
-from search.provenance import provenance
+from search.provenance import save_result
 from search.sampler import AuxLossSampler, SearchComplete
 from search.space import params_to_loss, suggest_aux_loss
 
@@ -108,8 +108,7 @@ def main() -> None:
         rows.append(measure(kind, args.workers, args.stages, args.seconds))
         print(json.dumps(rows[-1], indent=1), flush=True)
     if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps({**provenance(), "seconds": args.seconds, "runs": rows}, indent=1) + "\n")
+        save_result(args.out, seconds=args.seconds, runs=rows)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ environment steps each, one gradient step for each agent step of 4 environment s
 """
 
 import argparse
-import json
 import multiprocessing
 import time
 from pathlib import Path
@@ -20,7 +19,7 @@ from rich.table import Table
 from stable_baselines3.common.logger import configure
 from train_step import BATCH, fill, modes, ours, synchronize
 
-from search.provenance import provenance
+from search.provenance import save_result
 
 CANDIDATES = 700
 GRADIENT_STEPS = 500_000 // 4
@@ -85,8 +84,7 @@ def main() -> None:
                 table.add_row(setting, mode, str(processes), str(threads), f"{rate:,.1f}", f"{hours:,.0f}")
     Console(width=120).print(table)
     if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps({**provenance(), "device": args.device, "rows": rows}, indent=1) + "\n")
+        save_result(args.out, device=args.device, rows=rows)
 
 
 if __name__ == "__main__":

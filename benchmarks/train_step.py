@@ -15,7 +15,6 @@ GFLOP/s. The last column compares with that, scaled by the float32 peak of this 
 """
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -34,7 +33,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_aarl import SACAux
 from sb3_aarl.encoders import PixelEncoder
-from search.provenance import provenance
+from search.provenance import save_result
 
 ACTION_DIM = 6
 STATE_DIM = 17
@@ -263,8 +262,7 @@ def main() -> None:
         rows += measure(setting, args.device, variants, args.rounds, steps)
         show(rows)
     if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps({**provenance(), "threads": th.get_num_threads(), "rows": rows}, indent=1) + "\n")
+        save_result(args.out, threads=th.get_num_threads(), rows=rows)
 
 
 if __name__ == "__main__":

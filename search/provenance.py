@@ -1,6 +1,7 @@
 """Where a number comes from: commit, versions, machine and command, as plain values for JSON and notes."""
 
 import hashlib
+import json
 import os
 import platform
 import subprocess
@@ -8,6 +9,7 @@ import sys
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import torch as th
 
@@ -63,3 +65,14 @@ def provenance() -> dict[str, str]:
         "python": platform.python_version(),
         "versions": ", ".join(versions),
     }
+
+
+def save_result(path: Path, **result: Any) -> None:
+    """
+    Write a figure as JSON, with :func:`provenance` beside it.
+
+    :param path: File
+    :param result: What was measured, plain values
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**provenance(), **result}, indent=1) + "\n")
