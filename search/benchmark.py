@@ -16,8 +16,8 @@ import pandas as pd
 from sb3_aarl import catalog
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
-from search.config import ConfigError, load_hyperparameters, named_environments, resolve_env_id
-from search.grid import SCORELESS, Cell, check_training
+from search.config import ConfigError, action_repeat, load_hyperparameters, named_environments, resolve_env_id
+from search.grid import SCORELESS, Cell, all_cells, check_training
 from search.objective import end_noted, mean_curve
 from search.provenance import provenance
 from search.storage import open_storage
@@ -53,9 +53,7 @@ class Benchmark:
 
     @property
     def cells(self) -> list[Cell]:
-        """All runs, seed by seed, so that a first comparison is there early."""
-        product = itertools.product(self.seeds, self.checkpoints, self.files)
-        return [Cell(variant, environment, seed) for seed, environment, variant in product]
+        return all_cells(self.files, self.checkpoints, self.seeds)
 
     @property
     def trainings(self) -> dict[str, dict[str, Any]]:
@@ -191,7 +189,7 @@ def load_benchmark(
     paths = {path.stem: str(path) for path in files}
     benchmark = Benchmark(paths, hyperparameters, of_environment, seeds, every, evaluation_episodes)
     for (variant, settings), name in itertools.product(hyperparameters.items(), ids):
-        repeat = _action_repeat(settings[name])
+        repeat = action_repeat(settings[name])
         between = [step for step in benchmark.evaluations(name) if step % repeat]
         if between:
             raise ConfigError(
@@ -339,10 +337,6 @@ def _check_actions(environment: str) -> None:
             raise ConfigError(f"{environment} has no continuous actions, which SACAux needs, but {env.action_space}")
 
 
-def _action_repeat(settings: Mapping[str, Any]) -> int:
-    return (settings.get("env_kwargs") or {}).get("action_repeat", 1)
-
-
 def _checkpoints(
     environment: str, hyperparameters: Mapping[str, Mapping[str, Mapping[str, Any]]], asked_for: Sequence[int]
 ) -> tuple[int, ...]:
@@ -352,7 +346,7 @@ def _checkpoints(
             raise ConfigError(f"checkpoints must be positive environment steps in ascending order, not {list(asked_for)}")
         return tuple(asked_for)
     of_environment = [settings[environment] for settings in hyperparameters.values()]
-    budgets = [s["n_timesteps"] * _action_repeat(s) for s in of_environment if "n_timesteps" in s]
+    budgets = [s["n_timesteps"] * action_repeat(s) for s in of_environment if "n_timesteps" in s]
     budget = min(budgets, default=CHECKPOINTS[-1])
     if budget < CHECKPOINTS[0]:
         raise ConfigError(f"n_timesteps ends the training on {environment} at {budget} environment steps: name checkpoints")

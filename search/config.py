@@ -243,6 +243,15 @@ def load_aux_loss(path: str | Path) -> AuxLoss:
     return loss
 
 
+def action_repeat(hyperparameters: Mapping[str, Any]) -> int:
+    """
+    Environment steps of one agent step.
+
+    :param hyperparameters: As :func:`load_hyperparameters` gives them
+    """
+    return (hyperparameters.get("env_kwargs") or {}).get("action_repeat", 1)
+
+
 def resolve_env_id(name: str) -> str:
     """
     The id of an environment.
@@ -495,7 +504,7 @@ def _check(config: SearchConfig, where: str) -> None:
             baselines = config.baselines if env_id == config.environment else ()
             for overrides in ({}, *(baseline.overrides for baseline in baselines)):
                 settings = config.hyperparameters_for(env_id, overrides)
-                repeat = settings.get("env_kwargs", {}).get("action_repeat", 1)
+                repeat = action_repeat(settings)
                 steps = list(config.checkpoints_for(env_id))
                 ascending = bool(steps) and sorted(set(steps)) == steps and steps[0] > 0
                 check(ascending, f"checkpoints must be positive environment steps in ascending order, not {steps} ({env_id})")

@@ -4,7 +4,7 @@ import itertools
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -65,6 +65,19 @@ class Cell(NamedTuple):
     seed: int
 
 
+def all_cells(variants: Iterable[str], environments: Iterable[str], seeds: Iterable[int]) -> list[Cell]:
+    """
+    All runs of a comparison, seed by seed, so that a first one is there early.
+
+    :param variants: Names of what is trained
+    :param environments: Ids of the environments
+    :param seeds: Seeds of the trainings on each
+    """
+    return [
+        Cell(variant, environment, seed) for seed, environment, variant in itertools.product(seeds, environments, variants)
+    ]
+
+
 class Runs(Protocol):
     """A list of runs, as a study; picklable, because worker processes get it."""
 
@@ -116,9 +129,7 @@ class Grid:
 
     @property
     def cells(self) -> list[Cell]:
-        """All runs, seed by seed, so that a first comparison is there early."""
-        product = itertools.product(self.seeds, self.environments, self.variants)
-        return [Cell(variant, environment, seed) for seed, environment, variant in product]
+        return all_cells(self.variants, self.environments, self.seeds)
 
     @property
     def trainings(self) -> dict[str, dict[str, Any]]:

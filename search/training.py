@@ -21,7 +21,7 @@ from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
 from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
-from search.config import VEC_ENVS, load_aux_loss, load_hyperparameters, resolve_env_id
+from search.config import VEC_ENVS, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +124,7 @@ def train_candidate(
     n_envs, vec_env_cls = settings.pop("n_envs", 1), VEC_ENVS[settings.pop("vec_env", "dummy")]
     pixels = env_kwargs.get("pixels", False)
     policy = settings.pop("policy", "CnnPolicy" if pixels else "MlpPolicy")
-    agent_steps = checkpoints[-1] // env_kwargs.get("action_repeat", 1)
+    agent_steps = checkpoints[-1] // action_repeat(hyperparameters)
     if "buffer_size" in settings:
         # The same run, with smaller checkpoints; the buffer has as many places for each environment.
         settings["buffer_size"] = min(settings["buffer_size"], math.ceil(agent_steps / n_envs) * n_envs)
@@ -206,12 +206,12 @@ def train_and_keep(
     if isinstance(loss, str) and Path(loss).suffix in (".yml", ".yaml"):
         loss = load_aux_loss(loss)
     loss = None if loss in (None, "none") else loss if loss == "auto" else catalog.resolve(loss)
-    action_repeat = hyperparameters.get("env_kwargs", {}).get("action_repeat", 1)
+    repeat = action_repeat(hyperparameters)
     if environment_steps is None:
         if "n_timesteps" not in hyperparameters:
             raise ValueError(f"how many steps? {config} has no n_timesteps for {environment}")
-        environment_steps = hyperparameters["n_timesteps"] * action_repeat
-    checkpoints = spread_checkpoints(environment_steps, n_evaluations, action_repeat)
+        environment_steps = hyperparameters["n_timesteps"] * repeat
+    checkpoints = spread_checkpoints(environment_steps, n_evaluations, repeat)
     if folder is None:
         # A notation may be longer than a file's name may be.
         label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {aux_loss or 'auto'}".lower())[:80].strip("-")
