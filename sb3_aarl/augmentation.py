@@ -1,6 +1,8 @@
 """Image augmentation on tensors: random crop (CURL, the paper's table 7), random shift (DrQ), centre crop."""
 
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 from torch.nn import functional as F
 
 
@@ -59,3 +61,14 @@ def center_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
     _check_crop(images, size)
     top, left = ((length - size) // 2 for length in images.shape[2:])
     return images[:, :, top : top + size, left : left + size]
+
+
+def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
+    """
+    The images among observations.
+
+    :param space: Observation space, images channel first
+    :return: Key to image space; the key is empty where observations are not a Dict
+    """
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    return {key: part for key, part in parts.items() if isinstance(part, spaces.Box) and is_image_space(part)}

@@ -15,6 +15,8 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
+from sb3_aarl.augmentation import image_spaces
+
 
 class WindowSamples(NamedTuple):
     """
@@ -329,10 +331,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self._clear()
 
     @cached_property
-    def _image_keys(self) -> set[str]:
-        space = self.observation_space
-        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-        return {key for key, part in parts.items() if is_image_space(part)}
+    def _image_keys(self) -> frozenset[str]:
+        return frozenset(image_spaces(self.observation_space))
 
     @property
     def observations(self) -> Any:  # type: ignore[override]

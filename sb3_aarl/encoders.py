@@ -1,5 +1,6 @@
 """Encoders: SB3 features extractors from observations to the latent states that the auxiliary loss works on."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,7 +31,7 @@ def orthogonal_init(module: nn.Module) -> None:
         nn.init.zeros_(module.bias)
 
 
-class Encoder(BaseFeaturesExtractor):
+class Encoder(BaseFeaturesExtractor, ABC):
     """
     An encoder in two parts: a trunk, and a projection (linear, layer norm) from it to the latent state.
 
@@ -54,6 +55,7 @@ class Encoder(BaseFeaturesExtractor):
         layers = [nn.Linear(self.trunk_dim, self.features_dim), nn.LayerNorm(self.features_dim)]
         return nn.Sequential(*layers, *([nn.Tanh()] if self.tanh else [])).apply(orthogonal_init)
 
+    @abstractmethod
     def trunk(self, observations: th.Tensor) -> th.Tensor:
         """
         All but the projection.
@@ -61,7 +63,6 @@ class Encoder(BaseFeaturesExtractor):
         :param observations: (batch, ...) floats as SB3 preprocesses them
         :return: (batch, trunk_dim)
         """
-        raise NotImplementedError
 
     def project(self, trunk: th.Tensor) -> th.Tensor:
         """

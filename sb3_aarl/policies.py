@@ -1,6 +1,7 @@
 """Policies of SACAux: actor, critic and momentum target around one encoder, which belongs to the critic."""
 
 from collections.abc import Callable, Collection
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch as th
@@ -13,7 +14,7 @@ from stable_baselines3.sac.policies import Actor as SB3Actor
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
-from sb3_aarl.augmentation import center_crop, random_crop, random_shift
+from sb3_aarl.augmentation import center_crop, image_spaces, random_crop, random_shift
 from sb3_aarl.encoders import DenseMLP, Encoder, MultiInputEncoder, PixelEncoder, encoder_class, orthogonal_init
 
 AUGMENTATIONS = ("auto", "random_crop", "random_shift", "none")
@@ -25,9 +26,12 @@ class _CropsImages:
 
     crop_size: int | None
     features_extractor: Any
-    image_keys: frozenset[str]
     observation_space: spaces.Space
     normalize_images: bool
+
+    @cached_property
+    def image_keys(self) -> frozenset[str]:
+        return frozenset(image_spaces(self.observation_space))
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         return features_extractor(self.preprocess(obs))
@@ -121,7 +125,6 @@ class Actor(_CropsImages, SB3Actor):
         super().__init__(*args, **kwargs)
         self.share_features_extractor = share_features_extractor
         self.crop_size = crop_size
-        self.image_keys = frozenset(image_spaces(self.observation_space))
         self.squash_log_std = squash_log_std
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         # An encoder that learns nothing, such as SB3's FlattenExtractor, is read as it is.
@@ -181,7 +184,6 @@ class Critic(_CropsImages, ContinuousCritic):
     def __init__(self, *args: Any, crop_size: int | None = None, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.crop_size = crop_size
-        self.image_keys = frozenset(image_spaces(self.observation_space))
 
     def trunk(self, obs: PyTorchObs) -> Trunk:
         """
@@ -381,17 +383,6 @@ class MultiInputPolicy(SACAuxPolicy):
     """SACAuxPolicy for Dict observations of vectors and images. Parameters as there."""
 
     default_encoder = MultiInputEncoder
-
-
-def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
-    """
-    The images among observations.
-
-    :param space: Observation space, images channel first
-    :return: Key to image space; the key is empty where observations are not a Dict
-    """
-    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    return {key: part for key, part in parts.items() if isinstance(part, spaces.Box) and is_image_space(part)}
 
 
 def cropped_space(space: spaces.Space, size: int) -> spaces.Space:

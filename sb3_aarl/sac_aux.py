@@ -21,11 +21,12 @@ from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
 
 from sb3_aarl import catalog
+from sb3_aarl.augmentation import image_spaces
 from sb3_aarl.aux_head import AuxHead
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
 from sb3_aarl.cuda_graph import GraphedStep, unchecked_distributions
-from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy, image_spaces
+from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy
 
 logger = logging.getLogger(__name__)
 
@@ -350,12 +351,12 @@ class SACAux(SAC):
         self._update_learning_rates()
         step = self._graphed_step or self._gradient_step
         logs: list[dict[str, th.Tensor]] = []
-        for _ in range(gradient_steps):
-            self._n_updates += 1
-            batch, windows = self._draw(batch_size)
-            update_actor = self._n_updates % self.policy_delay == 0
-            update_target = self._n_updates % self.target_update_interval == 0
-            with self._gpu_settings():
+        with self._gpu_settings():
+            for _ in range(gradient_steps):
+                self._n_updates += 1
+                batch, windows = self._draw(batch_size)
+                update_actor = self._n_updates % self.policy_delay == 0
+                update_target = self._n_updates % self.target_update_interval == 0
                 logs.append(step(batch, windows, update_actor, update_target))
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
