@@ -33,8 +33,20 @@ logger = logging.getLogger(__name__)
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
 
 
+# A training whose Q values are this many times larger than rewards and entropy allow has diverged. Healthy ones overshoot by
+# less than ten times while they are learnt; those that explode go through a factor of a thousand on their way to infinity.
+EXPLODED = 1000.0
+# The largest log density of a squashed Gaussian for each dimension of an action: SB3 clips the log standard deviation at -20,
+# and takes the slope of tanh for 1e-6 at least.
+LARGEST_LOG_DENSITY = 34.0
+
+
 class NonFiniteError(FloatingPointError, ValueError):
     """An observation, reward, loss or parameter is NaN or infinite; the message says which and when."""
+
+
+class ExplodedError(FloatingPointError):
+    """Q values are far larger than rewards allow; the message says how large they are, may be, and when."""
 
 
 class SACAux(SAC):
@@ -211,6 +223,7 @@ class SACAux(SAC):
         self.aux_head: AuxHead | None = None
         self.aux_optimizer: th.optim.Optimizer | None = None
         self._n_aux_skipped = 0
+        self._largest_reward = 0.0
         self._random_state: dict[str, Any] | None = None
 
         if _init_setup_model:
@@ -351,6 +364,7 @@ class SACAux(SAC):
         self._update_learning_rates()
         step = self._graphed_step or self._gradient_step
         logs: list[dict[str, th.Tensor]] = []
+        rewards: list[th.Tensor] = []
         with self._gpu_settings():
             for _ in range(gradient_steps):
                 self._n_updates += 1
@@ -358,10 +372,14 @@ class SACAux(SAC):
                 update_actor = self._n_updates % self.policy_delay == 0
                 update_target = self._n_updates % self.target_update_interval == 0
                 logs.append(step(batch, windows, update_actor, update_target))
+                rewards.append(batch.rewards.abs().max())
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/aux_skipped", self._n_aux_skipped)
         first = self._n_updates - gradient_steps + 1
+        if rewards:
+            self._largest_reward = max(self._largest_reward, th.stack(rewards).max().item())
+        ent_coef = 0.0
         for name in dict.fromkeys(name for log in logs for name in log):
             steps = [first + i for i, log in enumerate(logs) if name in log]
             values = th.stack([log[name] for log in logs if name in log]).cpu().numpy()
@@ -369,6 +387,35 @@ class SACAux(SAC):
                 wrong = int(np.flatnonzero(~np.isfinite(values))[0])
                 raise NonFiniteError(f"{name} is {values[wrong]} at {self._step_and_loss(steps[wrong])}")
             self.logger.record(f"train/{name}", np.mean(values, dtype=np.float64))
+            # In the order of the gradient step, so that the entropy coefficient is known when the losses come.
+            if name == "ent_coef":
+                ent_coef = float(values.max())
+            elif name == "critic_loss":
+                self._check_q_values("the error of the Q values", np.sqrt(values), steps, ent_coef)
+            elif name == "actor_loss":  # minus the soft value of states, on average
+                self._check_q_values("the value of states", np.abs(values), steps, ent_coef)
+
+    def _check_q_values(self, name: str, values: np.ndarray, steps: list[int], ent_coef: float) -> None:
+        """
+        Stop a training that has diverged, long before it is infinite.
+
+        :param name: What is looked at
+        :param values: In units of returns, one for each gradient step
+        :param steps: Numbers of the gradient steps
+        :param ent_coef: Entropy coefficient
+        :raises ExplodedError: when one of them is ``EXPLODED`` times what the sum of discounted rewards and entropies can be
+        """
+        if self.gamma >= 1:
+            return
+        # Where rewards are tiny, or none came yet, the networks begin with values of about 1 nevertheless.
+        entropy = ent_coef * LARGEST_LOG_DENSITY * np.prod(self.action_space.shape)  # type: ignore[type-var]
+        bound = (max(1.0, self._largest_reward) + entropy) / (1 - self.gamma)
+        worst = int(np.argmax(values))
+        if values[worst] > EXPLODED * bound:
+            raise ExplodedError(
+                f"{name} is {values[worst]:.3g} at {self._step_and_loss(steps[worst])}; rewards of at most "
+                f"{self._largest_reward:.3g} and gamma={self.gamma} allow {bound:.3g}: the Q values have exploded"
+            )
 
     def _draw(self, batch_size: int) -> tuple[ReplayBufferSamples, WindowSamples | None]:
         """
