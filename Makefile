@@ -5,9 +5,10 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# Headless rendering for the tests from pixels; the browser for the test of optuna-dashboard.
+# Headless rendering for the tests from pixels; the browser for the test of optuna-dashboard; the database.
 RENDERING := libegl1 libosmesa6 libgl1-mesa-dri
 BROWSER := chromium chromium-driver
+DATABASE := postgresql
 
 .PHONY: demo test lint system clean
 
@@ -45,7 +46,7 @@ $(VENV)/.installed-dev: setup.cfg constraints.txt
 
 # Installs what is missing if that is possible without asking; else one line says what to do.
 system:
-	@missing=; for package in $(RENDERING) $(BROWSER); do \
+	@missing=; for package in $(RENDERING) $(BROWSER) $(DATABASE); do \
 		dpkg -s $$package >/dev/null 2>&1 || missing="$$missing $$package"; \
 	done; \
 	if [ -n "$$missing" ]; then \

@@ -7,9 +7,12 @@ from collections.abc import Iterable
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import psutil
 from optuna.exceptions import UpdateFinishedTrialError
+from optuna.storages import BaseStorage
+from optuna.storages._heartbeat import is_heartbeat_enabled
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
@@ -82,12 +85,30 @@ def fail(study: Study, trial: FrozenTrial, reason: str) -> bool:
         return False
 
 
+def beat(of: Study | BaseStorage, trial_id: int) -> None:
+    """
+    Give a sign of life for a running trial, where the storage keeps them.
+
+    ``study.optimize`` does so while the objective runs; this is for the time before, in which a trial is asked for.
+
+    :param of: Study or storage
+    :param trial_id: Identity of the trial in the storage, not its number
+    """
+    storage: Any = of._storage if isinstance(of, Study) else of
+    if is_heartbeat_enabled(storage):
+        storage.record_heartbeat(trial_id)
+
+
 def fail_dead(study: Study, trials: Iterable[FrozenTrial], all_have_names: bool = False) -> int:
     """
-    Fail the running trials whose worker has died on this machine, so that their places are given out again.
+    Fail the running trials whose worker is gone, so that their places are given out again.
+
+    Of this machine it is known at once which workers have died. Of all machines, and of workers that were stopped, it is
+    known by the signs of life of their trials, where the storage keeps them and this process keeps looking: more often
+    than once a heartbeat interval, for about two of them (see :class:`search.storage.WithHeartbeat`).
 
     :param study: The study
-    :param trials: Trials to look at
+    :param trials: Trials to look at; those without a sign of life are failed whether they are among these or not
     :param all_have_names: Whether all workers of the study give their names, so that one without has died
     :return: How many were failed
     """
@@ -104,4 +125,9 @@ def fail_dead(study: Study, trials: Iterable[FrozenTrial], all_have_names: bool 
             is_copy = "failed_trial" in trial.system_attrs and age < timedelta(seconds=10)
             died = not is_copy and is_dead(worker)
         failed += died and fail(study, trial, "its worker died")
+    storage: Any = study._storage
+    if is_heartbeat_enabled(storage):
+        reason = f"no sign of life from its worker for {2 * storage.get_heartbeat_interval()} seconds"
+        for trial_id in storage._get_stale_trial_ids(study._study_id):
+            failed += fail(study, storage.get_trial(trial_id), reason)
     return failed
