@@ -313,14 +313,19 @@ class SACAux(SAC):
         if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
             self.replay_buffer_kwargs["frame_stack"] = detect_frame_stack(self.env)
         n_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
-        return WindowReplayBuffer(
-            self.buffer_size,
-            self.observation_space,
-            self.action_space,
-            self.device,
-            self.n_envs,
-            **{**self.replay_buffer_kwargs, **(n_steps if self.n_steps > 1 else {})},
-        )
+        try:
+            return WindowReplayBuffer(
+                self.buffer_size,
+                self.observation_space,
+                self.action_space,
+                self.device,
+                self.n_envs,
+                **{**self.replay_buffer_kwargs, **(n_steps if self.n_steps > 1 else {})},
+            )
+        except (MemoryError, th.cuda.OutOfMemoryError) as error:
+            raise MemoryError(
+                f"no replay buffer of buffer_size={self.buffer_size} with observations {self.observation_space}: {error}"
+            ) from error
 
     def _setup_aux_loss(self, own_buffer: bool) -> None:
         encoder = list(self.critic.features_extractor.parameters())
@@ -408,7 +413,8 @@ class SACAux(SAC):
         if self.gamma >= 1:
             return
         # Where rewards are tiny, or none came yet, the networks begin with values of about 1 nevertheless.
-        entropy = ent_coef * LARGEST_LOG_DENSITY * np.prod(self.action_space.shape)  # type: ignore[type-var]
+        assert isinstance(self.action_space, spaces.Box)
+        entropy = ent_coef * LARGEST_LOG_DENSITY * float(np.prod(self.action_space.shape))
         bound = (max(1.0, self._largest_reward) + entropy) / (1 - self.gamma)
         worst = int(np.argmax(values))
         if values[worst] > EXPLODED * bound:
