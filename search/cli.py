@@ -1,6 +1,7 @@
 """The program ``aarl``. What the commands do lies elsewhere; imports that take seconds are made when they are needed."""
 
 import contextlib
+import signal
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import timedelta
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from optuna import Study
 
     from sb3_aarl import AuxLoss
-    from search.evolve import Progress
+    from search.evolve import Launch, Progress
     from search.grid import Cell, Runs
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__.partition("\n")[0])
@@ -40,13 +41,19 @@ def program() -> None:
 @contextlib.contextmanager
 def clear_errors() -> Iterator[None]:
     """What a user can mend is one line and exit code 2, not a traceback; Ctrl-C is exit code 130."""
-    from search.pool import WorkerError
+    from optuna.exceptions import StorageInternalError
+
+    from search.pool import WorkerError, message
     from search.training import TrainingError
 
+    # Clusters announce the end of a job with SIGTERM: what is there is put away as after Ctrl-C.
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
-    except (ValueError, OSError, TrainingError, WorkerError) as error:
-        errors.print(f"Error: {' '.join(str(error).split())}", style="red", markup=False, highlight=False)
+    except (ValueError, OSError, TrainingError, WorkerError, StorageInternalError) as error:
+        text = message(error) if isinstance(error, StorageInternalError) else " ".join(str(error).split())
+        errors.print(f"Error: {text}", style="red", markup=False, highlight=False)
         raise typer.Exit(2) from None
     except KeyboardInterrupt:
         errors.print("Interrupted. The same command goes on from the last checkpoint.", markup=False)
@@ -116,6 +123,14 @@ Threads = Annotated[
     int | None,
     typer.Option(help="Threads of each process; 1 may be fastest for small networks. Default: its share of the cores.", min=1),
 ]
+Heartbeat = Annotated[
+    int,
+    typer.Option(
+        help="Seconds between two signs of life of a worker; on another machine, one that has given none for twice as long "
+        "has died.",
+        min=1,
+    ),
+]
 SearchFile = Annotated[Path, typer.Argument(help="Configuration of a search, such as zoo_configs/search/demo.yml.")]
 
 
@@ -128,36 +143,121 @@ def run_folder(config: Path, folder: Path | None) -> Path:
 def search(
     config: SearchFile,
     storage: Storage = None,
-    workers: Workers = 1,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            help="Processes that train at the same time; 0 to begin the study and watch workers that are started elsewhere.",
+            show_default="1; with Ray as many as the cluster has room for",
+            min=0,
+        ),
+    ] = None,
     threads: Threads = None,
     stages: Annotated[int | None, typer.Option(help="Number of stages. Default: the file's.", min=1)] = None,
     pruner: Annotated[
         Literal["none", "median", "hyperband"] | None, typer.Option(help="Optuna's pruner. Default: the file's.")
     ] = None,
     folder: Folder = None,
+    heartbeat: Heartbeat = 60,
+    launcher: Annotated[
+        Literal["local", "ray"], typer.Option(help="Where workers run: on this machine, or on Ray.")
+    ] = "local",
+    ray_address: Annotated[
+        str | None, typer.Option(help="A running Ray cluster: auto, or host:port. Default: a Ray of its own on this machine.")
+    ] = None,
+    cpus_per_trial: Annotated[float, typer.Option(help="With Ray: cores of each worker.", min=0)] = 1,
+    gpus_per_trial: Annotated[float, typer.Option(help="With Ray: GPUs of each worker, such as 0.25.", min=0)] = 0,
 ) -> None:
     """Search for losses by evolution. Ctrl-C stops it, the same command goes on with it."""
     with clear_errors():
+        from functools import partial
+
         from search import evolve
         from search.config import load_config
+        from search.pool import WorkerPool
         from search.storage import without_password
 
         changes: dict[str, Any] = {"stages": stages, "pruner": pruner}
         settings = replace(load_config(config), **{key: value for key, value in changes.items() if value is not None})
         path = run_folder(config, folder)
         where = storage or str(path)
+        launch: Launch | None = None
+        if launcher == "ray" and workers != 0:
+            from search.ray_launcher import RayPool, check_storage
+
+            check_storage(where, ray_address)
+            launch = partial(
+                RayPool,
+                n_workers=workers,
+                cpus_per_trial=cpus_per_trial,
+                gpus_per_trial=gpus_per_trial,
+                address=ray_address,
+            )
+        elif workers != 0:
+            launch = partial(WorkerPool, n_workers=workers or 1, threads=threads)
         console.print(f"Study {settings.name} in {without_password(where)}", soft_wrap=True, markup=False)
-        shown: evolve.Progress | None = None
-        with live() as show:
-            for progress in evolve.search(settings, path, where, workers, threads):
-                # Without a terminal there is a line for everything that has changed.
-                if console.is_terminal or shown is None or progress.stages != shown.stages:
-                    show(_stages_table(progress) if console.is_terminal else _stages_line(progress))
-                shown = progress
+        shown = _show_progress(evolve.search(settings, path, where, launch, heartbeat))
         if shown is not None and shown.best is not None:
             console.print(f"Best so far: {shown.best_loss}, score {shown.best:.2f}", markup=False, soft_wrap=True)
         option = "" if storage is None else f" --storage {without_password(storage)}"
         console.print(f"To watch it: aarl dashboard {path}{option}", markup=False, soft_wrap=True)
+
+
+@app.command()
+def worker(
+    storage: Annotated[
+        str, typer.Option(help="Storage of the search: a URL such as postgresql://host/db or grpc://host:port, or a folder.")
+    ],
+    study: Annotated[str | None, typer.Option(help="Name of the search. Default: the only one there.")] = None,
+    workers: Workers = 1,
+    threads: Threads = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for checkpoints; shared by the machines if a candidate shall go on on another one. "
+            "Default: runs/NAME."
+        ),
+    ] = None,
+    heartbeat: Heartbeat = 60,
+) -> None:
+    """Join a search from any machine, until it is complete. It needs nothing but the storage."""
+    with clear_errors():
+        from functools import partial
+
+        from search import evolve
+        from search.pool import WorkerPool
+        from search.storage import without_password
+
+        console.print(f"Working for {without_password(storage)}", soft_wrap=True, markup=False)
+        launch = partial(WorkerPool, n_workers=workers, threads=threads)
+        _show_progress(evolve.join(storage, study, folder, launch, heartbeat))
+
+
+@app.command()
+def proxy(
+    storage: Annotated[str, typer.Option(help="URL of the database, such as postgresql://user@host/db.")],
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; the default is reached from this machine only. There is no password.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.")] = 13000,
+) -> None:
+    """Serve a database to many workers through Optuna's gRPC proxy; they take --storage grpc://host:port."""
+    with clear_errors():
+        from search.storage import serve_proxy
+
+        console.print(f"grpc://{host}:{port}  (Ctrl-C to stop)", highlight=False)
+        serve_proxy(storage, host, port)
+
+
+def _show_progress(progresses: "Iterator[Progress]") -> "Progress | None":
+    """Show how far a search is until it ends; the last state."""
+    shown: Progress | None = None
+    with live() as show:
+        for progress in progresses:
+            # Without a terminal there is a line for everything that has changed.
+            if console.is_terminal or shown is None or progress.stages != shown.stages:
+                show(_stages_table(progress) if console.is_terminal else _stages_line(progress))
+            shown = progress
+    return shown
 
 
 @contextlib.contextmanager

@@ -1,25 +1,30 @@
 """The evolution (paper, sections 2.2 and 3): a study that worker processes of one machine or many fill stage by stage."""
 
+import contextlib
 import logging
+import os
+import tempfile
 import time
-from collections.abc import Iterator
-from dataclasses import fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import optuna
+import yaml
 from optuna.artifacts import FileSystemArtifactStore
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
+from sb3_aarl.aux_loss import AuxLoss
 from search import grid, workers
-from search.config import SearchConfig
+from search.config import SearchConfig, load_config
 from search.dashboard import annotate_study, annotate_trial, update_plots
 from search.objective import CandidateFailed, Objective, make_pruner
-from search.pool import WorkerPool, uninterrupted
+from search.pool import Pool, uninterrupted
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
-from search.storage import open_storage
+from search.storage import HEARTBEAT_INTERVAL, PATIENCE, load_study, open_storage
 from search.trials import loss_of, ranked
 
 logger = logging.getLogger(__name__)
@@ -31,6 +36,11 @@ POLL_SECONDS = 1.0
 # Seconds between two drawings of the evolution: each stays in the storage, a hundred kilobytes for a whole search.
 PLOT_SECONDS = 300.0
 ARTIFACTS = "artifacts"  # folder of the pictures in notes
+# User attribute of a study: its configuration and file of hyper-parameters as text, for workers of other machines.
+CONFIG_KEY = "config"
+
+# Starts workers that run a function with its arguments: a pool with its number of processes, threads and so on.
+Launch = Callable[[Callable[..., None], tuple[Any, ...]], Pool]
 
 
 class Progress(NamedTuple):
@@ -78,17 +88,75 @@ def baseline_scores(config: SearchConfig, storage: optuna.storages.BaseStorage) 
     return [(str(name), float(score)) for name, score in scores.groupby("variant")["score"].mean().items()]
 
 
-def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
+def keep_config(study: optuna.Study, config: SearchConfig) -> None:
     """
-    Train candidates until the search is complete; any number of processes may do so.
+    Leave a configuration in its study, so that a worker needs the storage only.
 
+    :param study: The study
     :param config: The search
-    :param folder: Its folder, for checkpoints and curves
+    """
+    hidden = {"path": None, "hyperparameters": f"{config.name}-hyperparameters.yml"}
+    values = {item.name: hidden.get(item.name, getattr(config, item.name)) for item in fields(config)}
+    texts = {
+        f"{config.name}.yml": yaml.safe_dump(_plain({key: value for key, value in values.items() if value is not None})),
+        hidden["hyperparameters"]: config.hyperparameters.read_text(encoding="utf-8"),
+    }
+    if study.user_attrs.get(CONFIG_KEY) != texts:
+        study.set_user_attr(CONFIG_KEY, texts)
+
+
+def stored_config(study: optuna.Study, folder: Path) -> SearchConfig:
+    """
+    The configuration that :func:`keep_config` left in a study, checked like any other.
+
+    :param study: The study
+    :param folder: Folder of the search; the configuration's files are written into its folder ``config``
+    :raises ValueError: when the study has none, or one that cannot be used
+    """
+    name, texts = study.study_name, study.user_attrs.get(CONFIG_KEY)
+    if texts is None:
+        raise ValueError(f"study {name!r} has no configuration: begin it, or go on with it, with aarl search")
+    expected = {f"{name}.yml", f"{name}-hyperparameters.yml"}
+    is_text = isinstance(texts, dict) and texts.keys() == expected and all(isinstance(text, str) for text in texts.values())
+    if not is_text or Path(name).name != name:
+        raise ValueError(f"study {name!r} has a configuration of another kind")
+    folder = folder / "config"
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, text in texts.items():
+        # Other workers may be reading it.
+        descriptor, unfinished = tempfile.mkstemp(dir=folder)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as opened:
+            opened.write(text)
+        os.replace(unfinished, folder / file)
+    return load_config(folder / f"{name}.yml")
+
+
+def _plain(value: Any) -> Any:
+    """What YAML can say of a setting."""
+    if isinstance(value, AuxLoss):
+        return str(value)
+    if is_dataclass(value):
+        value = {item.name: getattr(value, item.name) for item in fields(value)}
+        return {key: "none" if key == "aux_loss" and item is None else _plain(item) for key, item in value.items()}
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
+    """
+    Train candidates until the search is complete; any number of processes on any machines may do so.
+
+    :param name: The search's study, which has its configuration
+    :param folder: Folder of the search, for checkpoints and curves
     :param where: Its storage, as for ``open_storage``
+    :param heartbeat: Seconds between two signs of life
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # it shows a failed trial with all of its traceback
+    storage = open_storage(where, create=False, patience=PATIENCE, heartbeat_interval=heartbeat)
+    config = stored_config(load_study(storage, name), folder)
     sampler = AuxLossSampler(**config.sampler_settings(), worker=workers.identity())
-    study = optuna.load_study(study_name=config.name, storage=open_storage(where), sampler=sampler, pruner=make_pruner(config))
+    study = optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=make_pruner(config))
     objective = Objective(config, folder / "candidates")
     artifacts = _artifacts(folder)
     failures = 0
@@ -122,7 +190,7 @@ def run_worker(config: SearchConfig, folder: Path, where: str) -> None:
 
 
 def search(
-    config: SearchConfig, folder: Path, where: str, n_workers: int = 1, threads: int | None = None
+    config: SearchConfig, folder: Path, where: str, launch: Launch | None, heartbeat: int = HEARTBEAT_INTERVAL
 ) -> Iterator[Progress]:
     """
     Run a search, or go on with it: all that it knows is in the storage.
@@ -132,8 +200,9 @@ def search(
     :param config: The search
     :param folder: Its folder
     :param where: Its storage, as for ``open_storage``
-    :param n_workers: Number of processes on this machine
-    :param threads: Threads of each, None for its share of the cores
+    :param launch: Starts the workers; None to begin the study and to watch workers that are started elsewhere
+    :param heartbeat: Seconds between two signs of life of a worker; one of another machine that has given none for twice as
+        long has died
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = open_storage(where)
@@ -143,38 +212,78 @@ def search(
     )
     of_all = {"environment": config.environment, "seeds": config.seeds}
     grid.check_training(study, {"candidates": of_all | grid.training(config, config.environment)})
-    progress = look(study, sampler, n_workers)  # refuses a study that was begun with other settings of the sampler
+    progress = look(study, sampler)  # refuses a study that was begun with other settings of the sampler
+    keep_config(study, config)
     annotate_study(study, settings(config), provenance())
     lines = baseline_scores(config, storage)
     yield progress
-    with WorkerPool(run_worker, (config, folder, where), n_workers, threads) as pool:
-        ended, drawn, busy = -1, 0.0, True
-        while busy:
-            now = sum(stage.filled + stage.failed for stage in progress.stages)
-            if now != ended and time.monotonic() - drawn > PLOT_SECONDS:
-                update_plots(study, lines)
-                drawn = time.monotonic()
-            busy = pool.check(progressed=now != ended)
-            ended = now
-            time.sleep(POLL_SECONDS)
-            progress = look(study, sampler, n_workers)
-            yield progress
+    ended, drawn = -1, 0.0
+    for progress in _fill(study, sampler, launch, folder, where, heartbeat):
+        if _ended(progress) != ended and time.monotonic() - drawn > PLOT_SECONDS:
+            update_plots(study, lines)
+            ended, drawn = _ended(progress), time.monotonic()
+        yield progress
     update_plots(study, lines)
 
 
-def look(study: optuna.Study, sampler: AuxLossSampler, n_workers: int) -> Progress:
+def join(
+    where: str, name: str | None, folder: Path | None, launch: Launch, heartbeat: int = HEARTBEAT_INTERVAL
+) -> Iterator[Progress]:
+    """
+    Work on a search that another program began, on this machine or another one, until it is complete.
+
+    :param where: Its storage, as for ``open_storage``
+    :param name: Its study, None for the only one
+    :param folder: Folder of the search, None for ``runs/NAME``. Where machines share it, candidates of a worker that died
+        go on from its checkpoints; else they begin anew
+    :param launch: Starts the workers
+    :param heartbeat: As for :func:`search`
+    """
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = open_storage(where, create=False)
+    name = load_study(storage, name).study_name
+    folder = folder or Path("runs") / name
+    study = load_study(storage, name)
+    sampler = AuxLossSampler(**stored_config(study, folder).sampler_settings())
+    yield look(study, sampler)
+    yield from _fill(study, sampler, launch, folder, where, heartbeat)
+
+
+def _fill(
+    study: optuna.Study, sampler: AuxLossSampler, launch: Launch | None, folder: Path, where: str, heartbeat: int
+) -> Iterator[Progress]:
+    """Let workers fill the places that are left; with none here, wait for those elsewhere."""
+    where = where if "://" in where else str(Path(where).absolute())
+    target = run_worker, (study.study_name, folder.absolute(), where, heartbeat)
+    with contextlib.nullcontext() if launch is None else launch(*target) as pool:
+        before, progress, busy = -1, look(study, sampler), True
+        while busy:
+            time.sleep(POLL_SECONDS)
+            ended = _ended(progress)
+            busy = pool is None or pool.check(progressed=ended != before)
+            before, progress = ended, look(study, sampler)
+            if pool is None:
+                busy = any(stage.filled < stage.places for stage in progress.stages)
+            yield progress
+
+
+def _ended(progress: Progress) -> int:
+    return sum(stage.filled + stage.failed for stage in progress.stages)
+
+
+def look(study: optuna.Study, sampler: AuxLossSampler) -> Progress:
     """
     How far a search is.
 
     :param study: The study
     :param sampler: Its sampler
-    :param n_workers: Workers that share what is left
     """
     stages = sampler.progress(study)
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     best = next(iter(ranked(complete, study.direction)), None)
     durations = [trial.duration.total_seconds() for trial in complete if trial.duration is not None]
     left = sum(stage.places - stage.filled for stage in stages)
+    n_workers = max(1, sum(stage.running for stage in stages))
     return Progress(
         stages,
         None if best is None else best.value,

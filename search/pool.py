@@ -8,9 +8,15 @@ import sys
 import threading
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import Any, Protocol
+
+import torch as th
+from optuna.exceptions import StorageInternalError
+
+from search.storage import without_password
 
 # Deaths of workers without a trial finished in between, after which the pool gives up.
 MAX_DEATHS = 5
@@ -22,11 +28,29 @@ class WorkerError(RuntimeError):
     """A worker stopped with an error, or workers keep dying; the message says why."""
 
 
+class Pool(Protocol):
+    """Workers that run one function until it returns; leaving the ``with`` block interrupts those that still run."""
+
+    def __enter__(self) -> "Pool": ...
+
+    def __exit__(self, *exception: Any) -> None: ...
+
+    def check(self, progressed: bool) -> bool:
+        """
+        Start workers again that died.
+
+        :param progressed: Whether a trial has finished since the last call
+        :return: Whether any worker still runs
+        :raises WorkerError: when a worker stopped with an error, or they keep dying
+        """
+        ...
+
+
 def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, threads: int) -> None:
     """What a worker process runs."""
-    import torch as th
-
-    signal.signal(signal.SIGINT, _interrupt_once)
+    # Clusters announce the end of a job with SIGTERM: there is time to put away what is there.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt_once)
     sys.unraisablehook = _interrupt_again
     th.set_num_threads(threads)
     threading.Thread(target=_stop_with_parent, args=(os.getppid(),), daemon=True).start()
@@ -35,8 +59,23 @@ def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, 
     except KeyboardInterrupt:
         os._exit(128 + signal.SIGINT)
     except Exception as error:
-        errors.put(f"{error}" if isinstance(error, ValueError) else traceback.format_exc())
+        errors.put(message(error))
         os._exit(1)
+
+
+def message(error: BaseException) -> str:
+    """
+    What a user is told of an error that stopped a worker: one line where he can mend it, else the traceback.
+
+    :param error: The error
+    """
+    if isinstance(error, (ValueError, OSError, StorageInternalError)):
+        # What the database said stands in the cause.
+        causes: list[BaseException] = [error]
+        while causes[-1].__cause__ is not None and isinstance(error, StorageInternalError):
+            causes.append(causes[-1].__cause__)
+        return without_password(" ".join(str(causes[-1]).split()))
+    return without_password("".join(traceback.format_exception(error)))
 
 
 _interrupted: dict[str, float] = {}
@@ -94,7 +133,8 @@ class WorkerPool:
     :param target: Function that each worker runs; it returns when nothing is left to do
     :param arguments: Its arguments, which must be picklable
     :param n_workers: Number of processes
-    :param threads: Threads of PyTorch and BLAS in each, None for its share of the cores
+    :param threads: Threads of PyTorch and BLAS in each, None for its share of the cores. GPUs are shared out: with more
+        than one, a worker sees the one that has the fewest others
     """
 
     def __init__(self, target: Callable[..., None], arguments: tuple[Any, ...], n_workers: int, threads: int | None = None):
@@ -107,6 +147,8 @@ class WorkerPool:
         self._start = (target, arguments, self._errors, threads or max(1, cores // n_workers))
         self.processes: list[BaseProcess] = []
         self.deaths = 0
+        self._gpus = visible_gpus()
+        self._gpu_of: dict[BaseProcess, str] = {}
         self._n_workers = n_workers
 
     def __enter__(self) -> "WorkerPool":
@@ -116,10 +158,15 @@ class WorkerPool:
 
     def _add(self) -> None:
         # Two threads of BLAS or OpenMP for each of two workers on two cores are four: slower than one each.
-        with _environment(OMP_NUM_THREADS=str(self._start[-1]), MKL_NUM_THREADS=str(self._start[-1])):
+        variables = {"OMP_NUM_THREADS": str(self._start[-1]), "MKL_NUM_THREADS": str(self._start[-1])}
+        if len(self._gpus) > 1:
+            taken = Counter(self._gpu_of[process] for process in self.processes)
+            variables["CUDA_VISIBLE_DEVICES"] = min(self._gpus, key=lambda gpu: taken[gpu])
+        with _environment(**variables):
             process = self._context.Process(target=_work, args=self._start)
             process.start()
         self.processes.append(process)
+        self._gpu_of[process] = variables.get("CUDA_VISIBLE_DEVICES", "")
 
     def check(self, progressed: bool) -> bool:
         """
@@ -134,6 +181,7 @@ class WorkerPool:
             if process.exitcode is None:
                 continue
             self.processes.remove(process)
+            self._gpu_of.pop(process)
             if not self._errors.empty():
                 raise WorkerError(self._errors.get())
             if process.exitcode == 128 + signal.SIGINT:
@@ -158,6 +206,14 @@ class WorkerPool:
                 return
         for process in self.processes:
             process.kill()
+
+
+def visible_gpus() -> list[str]:
+    """The GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return (
+        [name for name in named.split(",") if name] if named is not None else [str(i) for i in range(th.cuda.device_count())]
+    )
 
 
 @contextlib.contextmanager

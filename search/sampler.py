@@ -37,8 +37,8 @@ SETTINGS_KEY = "AuxLossSampler:settings"
 
 # Draws for one place before a duplicate is accepted: only very small spaces run out of new losses.
 MAX_DRAWS = 300
-# How often a candidate is given out again after its worker died, before it is taken for the cause.
-MAX_DEATHS = 10
+# A study that was begun before this could be chosen has it.
+RETRIES = 10
 # Seconds without a sign of life after which a trial that never got a place is given up.
 ORPHAN_SECONDS = 60.0
 
@@ -118,8 +118,8 @@ class _Register:
         """Whether another trial has the place of this one."""
         return any(holder.number != number for holder in self.held_by(*self.places[number]))
 
-    def attempt(self, stage: int, place: int) -> int:
-        """How many candidates of the place were given up because they failed."""
+    def attempt(self, stage: int, place: int, retries: int) -> int:
+        """How many candidates of the place were given up because they failed, or their workers died too often."""
         attempt = deaths = 0
         for number in self.holders.get((stage, place), ()):
             trial = self.trials[number]
@@ -128,7 +128,7 @@ class _Register:
             rejected = REJECTED_KEY in trial.system_attrs and trial.state in (TrialState.FAIL, TrialState.PRUNED)
             # Without the mark of a live worker it was the worker that died: the same candidate has another try.
             deaths += trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted")
-            if rejected or deaths > MAX_DEATHS:
+            if rejected or deaths > retries:
                 attempt, deaths = attempt + 1, 0
         return attempt
 
@@ -173,9 +173,11 @@ class AuxLossSampler(BaseGASampler):
     :param seed: Seed of the evolution. None for a random one, kept in the study; a study keeps its first seed
     :param screening: Offspring that are drawn for each place, of which the one is kept that a Bayesian linear model of
         the tokens, fitted to the stages before, rates highest under one posterior draw; 1 for the paper's evolution
+    :param retries: How often a candidate is given out again after its worker died, before it is taken for the cause
     :param n_stages: Number of stages, after which ``ask`` raises :class:`SearchComplete`; None for no end
     :param worker: Identity of this process (``workers.identity()``). Places of a worker of this machine that has died
-        are given out again. None where trials are told by another process than the one that asked
+        are given out again, and where the storage has heartbeats, a trial has one as soon as it is asked for
+        (``study.optimize`` goes on with them). None where trials are told by another process than the one that asked
     :raises ValueError: naming the argument that does not fit
     """
 
@@ -194,6 +196,7 @@ class AuxLossSampler(BaseGASampler):
         allow_duplicates: bool = False,
         seed: int | None = None,
         screening: int = 1,
+        retries: int = RETRIES,
         n_stages: int | None = None,
         worker: str | None = None,
     ):
@@ -204,7 +207,7 @@ class AuxLossSampler(BaseGASampler):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, not {value}")
         shares = {"random": random, "replacement": replacement, "crossover": crossover, "horizon_change": horizon_change}
-        for name, share in {**shares, "n_random": n_random, "n_prior": n_prior}.items():
+        for name, share in {**shares, "n_random": n_random, "n_prior": n_prior, "retries": retries}.items():
             if share < 0:
                 raise ValueError(f"{name} must not be negative, not {share}")
         if abs(sum(shares.values()) - 1) > 1e-9:
@@ -221,6 +224,7 @@ class AuxLossSampler(BaseGASampler):
         self.allow_duplicates = allow_duplicates
         self.seed = seed
         self.screening = screening
+        self.retries = retries
         self.n_stages = n_stages
         self.worker = worker
         # Operations place by place: what needs no parents comes first, so that it can be given out early.
@@ -292,6 +296,7 @@ class AuxLossSampler(BaseGASampler):
         try:
             if self.worker is not None:
                 study._storage.set_trial_user_attr(trial._trial_id, workers.WORKER_KEY, self.worker)
+                workers.beat(study._storage, trial._trial_id)
             self._find_place(study, trial)
         except BaseException:
             # Interrupted while it waited, or nothing is left to do.
@@ -373,17 +378,19 @@ class AuxLossSampler(BaseGASampler):
             "operators": None if self.operators is None else list(self.operators),
             "allow_duplicates": self.allow_duplicates,
             "screening": self.screening,
+            "retries": self.retries,
         }
         begun = study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY)
         if begun is None:
             study._storage.set_study_system_attr(study._study_id, SETTINGS_KEY, settings)
             return
+        begun = {"retries": RETRIES, **begun}
         for name, value in settings.items():
             if begun.get(name) != value:
                 raise ValueError(f"this study was begun with {name}={begun.get(name)!r}, not {value!r}: use another study")
 
     def _find_place(self, study: Study, trial: FrozenTrial) -> None:
-        wait = _Wait(study, trial)
+        wait = _Wait(study, trial, beats=self.worker is not None)
         while True:
             with self._lock:
                 self._refresh(study)
@@ -429,7 +436,7 @@ class AuxLossSampler(BaseGASampler):
     def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int, is_given: bool) -> bool:
         """Take a place for a trial; False if another one did so at the same moment."""
         evolution = self._get_evolution(study)
-        attempt = self._register.attempt(stage, place)
+        attempt = self._register.attempt(stage, place, self.retries)
         operation, parents, loss = "enqueued", [], None
         if not is_given:
             candidate = evolution.candidate(stage, place, attempt)
@@ -444,7 +451,12 @@ class AuxLossSampler(BaseGASampler):
             self._give_back(study, trial)
             return False
         # For people: what a lineage in the dashboard is made of.
-        shown = {"stage": stage, "place": place, "operation": operation, "parents": parents}
+        shown: dict[str, Any] = {"stage": stage, "place": place, "operation": operation, "parents": parents}
+        if attempt:
+            replaced = max(number for number in self._register.holders[stage, place] if number != trial.number)
+            reason = self._register.trials[replaced].user_attrs.get("reason", "it failed")
+            logger.warning("Trial %d is given up for another candidate: %s", replaced, reason)
+            shown["replaces"] = replaced
         for key, value in shown.items():
             storage.set_trial_user_attr(trial_id, key, value)
         return True
@@ -497,9 +509,10 @@ def _is_invalid(trial: FrozenTrial) -> bool:
 class _Wait:
     """Waiting for a place: cheap, visible in the log and as a user attribute, and not for the dead."""
 
-    def __init__(self, study: Study, trial: FrozenTrial):
+    def __init__(self, study: Study, trial: FrozenTrial, beats: bool):
         self.study = study
         self.trial = trial
+        self.beats = beats
         self.delay = 0.001
         self.queue: list[int] = []
         self.shown = 0.0
@@ -523,6 +536,8 @@ class _Wait:
                 workers.fail(self.study, other, "its worker died before it got a place")
         if now - self.shown > ORPHAN_SECONDS / 6 and self.delay > 0.1:
             self.shown = now
+            if self.beats:
+                workers.beat(self.study._storage, self.trial._trial_id)
             logger.info("Trial %d waits for a place: %d trials run", self.trial.number, len(running))
             # Changes each time: a sign of life for the trials behind this one.
             storage = self.study._storage

@@ -1,14 +1,17 @@
-"""Worker processes: Ctrl-C, threads."""
+"""Worker processes: Ctrl-C, threads, GPUs, errors."""
 
+import errno
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch as th
+from optuna.exceptions import StorageInternalError
 
-from search.pool import WorkerPool
+from search.pool import WorkerError, WorkerPool
 
 
 def put_away(folder: Path) -> None:
@@ -87,3 +90,60 @@ def test_threads_are_those_asked_for_or_all_cores(threads: int | None, expected:
         while pool.check(progressed=False):
             time.sleep(0.01)
     assert (tmp_path / "threads").read_text() == f"{expected} {expected}"
+
+
+def write_gpu(folder: Path) -> None:
+    """A worker that says which GPU it may use, and waits."""
+    (folder / str(os.getpid())).write_text(os.environ["CUDA_VISIBLE_DEVICES"])
+    while not (folder / "done").exists():
+        time.sleep(0.01)
+
+
+def test_gpus_are_shared_out_and_a_new_worker_takes_that_of_the_dead_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
+
+    def seen() -> list[str]:
+        files = [tmp_path / str(process.pid) for process in pool.processes]
+        for file in files:
+            wait_for(file)
+        return sorted(file.read_text() for file in files)
+
+    with WorkerPool(write_gpu, (tmp_path,), n_workers=3, threads=1) as pool:
+        assert seen() == ["2", "2", "5"]
+        (of_five,) = [p for p in pool.processes if (tmp_path / str(p.pid)).read_text() == "5"]
+        of_five.kill()
+        of_five.join()
+        assert pool.check(progressed=False)
+        assert seen() == ["2", "2", "5"]
+        (tmp_path / "done").touch()
+        while pool.check(progressed=False):
+            time.sleep(0.01)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "2,5"
+
+
+def full_disk(_: Path) -> None:
+    """A worker whose disk is full."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/data/journal.log")
+
+
+def lost_database(_: Path) -> None:
+    """A worker whose database fails, with its password in the message."""
+    try:
+        raise RuntimeError("disk full on postgresql://me:secret@host/db")
+    except RuntimeError as error:
+        raise StorageInternalError("during the commit") from error
+
+
+@pytest.mark.parametrize(
+    ("target", "expected"),
+    [
+        (full_disk, r"^\[Errno 28\] No space left on device: '/data/journal.log'$"),
+        (lost_database, r"^disk full on postgresql://me:\*\*\*@host/db$"),
+    ],
+)
+def test_what_a_user_can_mend_is_one_line(target: Callable[[Path], None], expected: str, tmp_path: Path) -> None:
+    with pytest.raises(WorkerError, match=expected), WorkerPool(target, (tmp_path,), n_workers=1, threads=1) as pool:
+        while pool.check(progressed=False):
+            time.sleep(0.01)

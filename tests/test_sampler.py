@@ -420,7 +420,7 @@ def test_the_place_of_a_dead_worker_gets_the_same_candidate_and_that_of_a_failed
         study.tell(trial, state=TrialState.FAIL)
     assert losses[0] == losses[1] == losses[2] != losses[3]
     # A loss that kills every worker is given up at last.
-    for _ in range(module.MAX_DEATHS):
+    for _ in range(module.RETRIES):
         trial = study.ask()
         losses.append(suggest_aux_loss(trial, 2))
         workers.fail(study, study.trials[trial.number], "its worker died")

@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -13,6 +12,7 @@ import optuna
 import pytest
 import yaml
 from optuna.trial import TrialState
+from program import aarl, start
 
 from sb3_aarl import AuxLoss
 from search.space import params_to_loss
@@ -57,29 +57,6 @@ def config(tmp_path: Path) -> Path:
     path = tmp_path / "small.yml"
     path.write_text(SEARCH)
     return path
-
-
-def start(*arguments: object, folder: Path) -> subprocess.Popen[str]:
-    """The program, in a process group of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "search.cli", *map(str, arguments)],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "COLUMNS": "200"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-        # Whoever runs the tests in the background (nohup, CI) may ignore Ctrl-C, and children inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-
-
-def aarl(*arguments: object, folder: Path) -> str:
-    """Run the program to its end, which must be a good one."""
-    process = start(*arguments, folder=folder)
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-    return output
 
 
 def trials(folder: Path, study: str = "small") -> list[optuna.trial.FrozenTrial]:

@@ -1,0 +1,140 @@
+"""Workers that join a search: all they need is in its storage."""
+
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+from program import aarl, start
+
+from search import evolve
+from search.config import SearchConfig, load_config
+
+CONFIGS = sorted(Path("zoo_configs/search").glob("*.yml"))
+TINY = """\
+environment: Pendulum-v1
+hyperparameters: own.yml
+checkpoints: [40, 80]
+evaluation_episodes: 1
+stages: 2
+n_random: 3
+n_prior: 1
+population_size: 4
+parents: 0.5
+max_horizon: 2
+"""
+HYPERPARAMETERS = """\
+default:
+  policy: MlpPolicy
+  n_timesteps: 80
+  learning_starts: 20
+  batch_size: 8
+  policy_kwargs: {net_arch: [8], features_extractor_class: mlp, features_extractor_kwargs: {features_dim: 4}}
+"""
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    """A search of seconds."""
+    (tmp_path / "own.yml").write_text(HYPERPARAMETERS)
+    (tmp_path / "tiny.yml").write_text(TINY)
+    return tmp_path / "tiny.yml"
+
+
+def complete(where: str) -> list[tuple[int, int]]:
+    """Stage and place of the trials that are complete."""
+    study = optuna.load_study(study_name="tiny", storage=evolve.open_storage(where, create=False))
+    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    return sorted((trial.user_attrs["stage"], trial.user_attrs["place"]) for trial in trials)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_a_configuration_comes_back_from_a_study_as_it_was(path: Path, tmp_path: Path) -> None:
+    config = replace(load_config(path), stages=3, pruner="median")
+    study = optuna.create_study(study_name=config.name)
+    evolve.keep_config(study, config)
+    stored = evolve.stored_config(study, tmp_path)
+
+    def without_paths(config: SearchConfig) -> SearchConfig:
+        return replace(config, path=Path(), hyperparameters=Path())
+
+    assert without_paths(stored) == without_paths(config)
+    assert stored.name == config.name
+    environments = [config.environment, *(config.cross_validation.environments if config.cross_validation else ())]
+    for environment in environments:
+        assert stored.hyperparameters_for(environment) == config.hyperparameters_for(environment)
+
+
+@pytest.mark.parametrize(
+    ("texts", "problem"),
+    [
+        (None, "begin it"),
+        ("environment: Pendulum-v1", "another kind"),
+        ({"../evil.yml": "", "x-hyperparameters.yml": ""}, "another kind"),
+        ({"x.yml": 1, "x-hyperparameters.yml": ""}, "another kind"),
+        ({"x.yml": "!!python/object/apply:os.system [touch evil]", "x-hyperparameters.yml": ""}, "not YAML of plain values"),
+        ({"x.yml": "environmen: Pendulum-v1", "x-hyperparameters.yml": ""}, "nearest known key: 'environment'"),
+    ],
+    ids=["none", "text", "name", "number", "code", "key"],
+)
+def test_what_a_foreign_study_says_is_refused(
+    texts: object, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    study = optuna.create_study(study_name="x")
+    if texts is not None:
+        study.set_user_attr(evolve.CONFIG_KEY, texts)
+    with pytest.raises(ValueError, match=problem):
+        evolve.stored_config(study, tmp_path / "folder")
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+def test_a_study_whose_name_is_a_path_writes_nothing_elsewhere(tmp_path: Path) -> None:
+    study = optuna.create_study(study_name="../evil")
+    study.set_user_attr(evolve.CONFIG_KEY, {"../evil.yml": TINY, "../evil-hyperparameters.yml": HYPERPARAMETERS})
+    with pytest.raises(ValueError, match="another kind"):
+        evolve.stored_config(study, tmp_path / "folder")
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+def test_workers_need_nothing_but_the_storage(config: Path, tmp_path: Path) -> None:
+    where = f"sqlite:///{tmp_path / 'study.db'}"
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    watching = start("search", config, "--storage", where, "--workers", 0, folder=tmp_path)
+    for line in watching.stdout or ():
+        if "stage 1: 0/4 done" in line:
+            break
+    config.unlink()
+    output = aarl("worker", "--storage", where, "--study", "tiny", "--workers", 2, "--threads", 1, folder=elsewhere)
+    assert "stage 2: 4/4 done" in output
+    output, _ = watching.communicate(timeout=60)
+    assert watching.returncode == 0 and "stage 2: 4/4 done" in output, output
+    assert complete(where) == [(stage, place) for stage in (1, 2) for place in range(4)]
+    assert (elsewhere / "runs/tiny/candidates").is_dir() and not (tmp_path / "runs/tiny/candidates").exists()
+
+
+def test_the_end_of_a_clusters_job_is_an_interruption(config: Path, tmp_path: Path) -> None:
+    config.write_text(TINY.replace("[40, 80]", "[40, 4000]"))
+    (tmp_path / "own.yml").write_text(HYPERPARAMETERS.replace("80", "4000"))
+    process = start("search", config, "--threads", 1, folder=tmp_path)
+    for line in process.stdout or ():
+        if "1 running" in line:
+            break
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Interrupted" in output and "Traceback" not in output, output
+    study = optuna.load_study(study_name="tiny", storage=evolve.open_storage(tmp_path / "runs/tiny", create=False))
+    (trial,) = study.trials
+    assert trial.state == TrialState.FAIL and trial.user_attrs["interrupted"]
+
+
+def test_an_unknown_study_is_one_line(config: Path, tmp_path: Path) -> None:
+    where = f"sqlite:///{tmp_path / 'study.db'}"
+    optuna.create_study(study_name="other", storage=where)
+    for name, problem in (("tiny", "no study 'tiny': the storage has other"), ("other", "no configuration")):
+        process = start("worker", "--storage", where, "--study", name, folder=tmp_path)
+        output, _ = process.communicate(timeout=60)
+        assert process.returncode == 2 and problem in output and "Traceback" not in output, output
