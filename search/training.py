@@ -3,9 +3,12 @@
 import contextlib
 import functools
 import hashlib
+import io
 import json
 import logging
 import math
+import os
+import pickle
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +24,7 @@ from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
 from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
+from search.checkpoint import CheckpointError, ResumableEnv, is_disk_error, opened, seal, sync_folder, user_key
 from search.config import VEC_ENVS, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
 
 logger = logging.getLogger(__name__)
@@ -93,12 +97,14 @@ def train_candidate(
     """
     Train SACAux with an auxiliary loss up to the last checkpoint, and evaluate it at each.
 
-    With a folder, a training that was killed goes on from its last evaluation: model, optimizers, replay buffer and
-    random generators are as they were. The state of the simulation is not saved: the episode that ran is cut off there
-    (the buffer takes it for truncated) and a new one begins, so the rest differs from that of a run that was not
-    killed. A checkpoint that is torn, or of other settings, is refused, and the training begins anew. When it is over,
-    for whatever reason but an interruption, the checkpoint is removed and ``curve.csv`` stays; a training whose curve
-    is complete is not repeated.
+    With a folder, a training that was killed goes on from its last evaluation: model, optimizers, replay buffer, random
+    generators and simulation are as they were, and on a CPU it ends bit for bit like one that was not killed. Where the
+    simulation cannot be saved (an environment that does not pickle, or without its state as Gymnasium's MuJoCo tasks), the
+    episode that ran is cut off (the buffer takes it for truncated) and one with another seed begins; a line of log says so.
+    Checkpoints are signed with a key of the user's, see ``search.checkpoint``: one that is torn, of another user or of
+    other settings is refused before anything of it is unpickled, and the training begins anew. When it is over, for
+    whatever reason but an interruption or an error of the disk, the checkpoint is removed and ``curve.csv`` stays; a
+    training whose curve is complete is not repeated.
 
     With ``n_envs`` environments in the hyper-parameters, all of their steps count, and a checkpoint that lies between two
     steps of them is evaluated after the second. ``gradient_steps: -1`` keeps one update for each transition.
@@ -115,6 +121,7 @@ def train_candidate(
     :param keep_model: Whether to leave the trained model as ``model.zip`` in the folder
     :param progress_bar: Whether to show a progress bar
     :raises TrainingError: when the training fails while it runs, the cause being its ``__cause__``
+    :raises OSError: when the disk is full or broken; the last checkpoint stays, and the same call goes on from it
     :raises FileExistsError: when the folder has the model of another training
     :raises ValueError: when environment or model cannot be made of these settings
     """
@@ -141,7 +148,7 @@ def train_candidate(
         # longer than the prediction from it, and each environment that renders has tens of megabytes for it.
         n_eval, eval_cls = (min(n_envs, evaluation_episodes), vec_env_cls) if pixels else (evaluation_episodes, DummyVecEnv)
         with (
-            _closed(make(n_envs, seed=seed, vec_env_cls=vec_env_cls)) as env,
+            _closed(make(n_envs, seed=seed, vec_env_cls=vec_env_cls, wrapper_class=ResumableEnv)) as env,
             _closed(make(n_eval, seed=0, vec_env_cls=eval_cls, wrapper_class=SingleEpisodes)) as eval_env,
         ):
             try:
@@ -162,6 +169,8 @@ def train_candidate(
                     _learn(model, agent_steps, [curve_callback, *saving], progress_bar)
                     if store is not None and keep_model:
                         store.save_model(model)
+            except OSError:
+                raise  # of the disk: the checkpoint waits for a better one
             except Exception:
                 # Not after an interruption, which is no Exception.
                 if store is not None:
@@ -247,11 +256,13 @@ def _repeat(curve: Sequence[Evaluation], on_evaluation: Callable[[Evaluation], b
 
 
 def _learn(model: SACAux, agent_steps: int, callbacks: list[BaseCallback], progress_bar: bool) -> None:
-    """Train up to a number of agent steps; whatever goes wrong is the candidate's failure."""
+    """Train up to a number of agent steps; whatever goes wrong, but for the disk, is the candidate's failure."""
     try:
         remaining = agent_steps - model.num_timesteps
         model.learn(remaining, callbacks, log_interval=10**9, reset_num_timesteps=False, progress_bar=progress_bar)
     except Exception as error:
+        if is_disk_error(error):
+            raise
         raise TrainingError(" ".join(f"{type(error).__name__}: {error}".split())) from error
 
 
@@ -285,24 +296,29 @@ class _RunFolder:
         return curve if [evaluation.environment_steps for evaluation in curve] == list(checkpoints) else None
 
     def load(self, env: VecEnv, device: str) -> tuple[SACAux | None, list[Evaluation]]:
-        """The last checkpoint: model with replay buffer, and its curve; without one, the folder begins anew."""
+        """The last checkpoint: model with replay buffer, its curve, simulations in ``env``; without one, all begins anew."""
         saved = [path for path in self._checkpoints.glob("*") if path.name.isdecimal()]
         if saved:
             newest = max(saved, key=lambda path: int(path.name))
             try:
-                if not _holds(newest, self.description):
-                    raise ValueError("it belongs to a training with other settings")
-                curve = read_curve(newest / "curve.csv")
-                model = SACAux.load(newest / "model.zip", env, device=device)
-                model.load_replay_buffer(newest / "replay_buffer.pkl")
-            except Exception as error:  # what a torn file does to zipfile, pickle and torch
+                with opened(newest, user_key()) as (files, about):
+                    if not _holds(newest, self.description):
+                        raise CheckpointError("it belongs to a training with other settings")
+                    curve = read_curve(newest / "curve.csv")
+                    model = SACAux.load(files["model.zip"], env, device=device, force_reset=False)
+                    model.load_replay_buffer(files["replay_buffer.pkl"])
+                    cut_off = about["cut_off"] or _load_simulations(env, pickle.load(files["environments.pkl"]))
+            except OSError:
+                raise  # of the disk, which says nothing of the checkpoint
+            except Exception as error:  # what other versions do to pickle and torch
                 logger.warning("The checkpoint %s is of no use, training begins anew: %s", newest, error)
             else:
-                # Not the initial states of the beginning again.
-                vec_env = model.get_env()
-                assert vec_env is not None
-                vec_env.seed(HALF + (self.seed + model.num_timesteps) % HALF)
                 logger.info("Training goes on after %d environment steps", curve[-1].environment_steps)
+                if cut_off:
+                    logger.warning("The episode that ran in %s is cut off, a new one begins: %s", self.folder, cut_off)
+                    model._last_obs = None
+                    # Not the initial states of the beginning again.
+                    env.seed(HALF + (self.seed + model.num_timesteps) % HALF)
                 return model, curve
         self.remove_checkpoint()
         if self.model_path.exists():
@@ -313,27 +329,48 @@ class _RunFolder:
         return None, []
 
     def save(self, model: SACAux, curve: Sequence[Evaluation]) -> None:
-        """Put a checkpoint in the place of the one before, in one step."""
+        """Put a checkpoint in the place of the one before, in one step; none without a key to sign it with."""
+        key = user_key()
+        if key is None:
+            return
         unfinished = self._checkpoints / "unfinished"
-        unfinished.mkdir(parents=True, exist_ok=True)
-        model.save(unfinished / "model.zip")
-        model.save_replay_buffer(unfinished / "replay_buffer.pkl")
-        write_curve(unfinished / "curve.csv", curve)
-        self._describe(unfinished)
-        checkpoint = unfinished.rename(self._checkpoints / str(curve[-1].environment_steps))
+        _remove(unfinished)
+        unfinished.mkdir(parents=True)
+        env = model.get_env()
+        assert env is not None
+        try:
+            _save_model(model, unfinished / "model.zip")
+            with (unfinished / "replay_buffer.pkl").open("wb") as file:
+                model.save_replay_buffer(file)
+            states = env.env_method("dump_state")
+            cut_off = next((state for state in states if isinstance(state, str)), None)
+            if cut_off is None:
+                (unfinished / "environments.pkl").write_bytes(pickle.dumps(states))
+            write_curve(unfinished / "curve.csv", curve)
+            self._describe(unfinished)
+            seal(unfinished, key, {"cut_off": cut_off})
+            checkpoint = unfinished.rename(self._checkpoints / str(curve[-1].environment_steps))
+        except BaseException:
+            _remove(unfinished)  # half of it may be what fills the disk
+            raise
+        sync_folder(self._checkpoints)
         for path in self._checkpoints.glob("*"):
             if path != checkpoint:
-                shutil.rmtree(path)
+                _remove(path)
 
     def save_model(self, model: SACAux) -> None:
         """Leave the trained model in the folder."""
         unfinished = self.folder / "unfinished.zip"
-        model.save(unfinished)
-        unfinished.replace(self.model_path)
+        try:
+            _save_model(model, unfinished)
+            unfinished.replace(self.model_path)
+        except BaseException:
+            _remove(unfinished)
+            raise
 
     def remove_checkpoint(self) -> None:
         """Replay buffers are large."""
-        shutil.rmtree(self._checkpoints, ignore_errors=True)
+        _remove(self._checkpoints)
 
     def _describe(self, folder: Path) -> None:
         (folder / "run.json").write_text(json.dumps(self.description, indent=1) + "\n", encoding="utf-8")
@@ -345,6 +382,31 @@ def _holds(folder: Path, description: Mapping[str, Any]) -> bool:
         return json.loads((folder / "run.json").read_text(encoding="utf-8")) == description
     except (OSError, ValueError):
         return False
+
+
+def _save_model(model: SACAux, path: Path) -> None:
+    """Through Python's own files: torch makes a RuntimeError of a disk that is full."""
+    content = io.BytesIO()
+    model.save(content)
+    with path.open("wb") as file:
+        file.write(content.getbuffer())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _load_simulations(env: VecEnv, states: Sequence[bytes]) -> str | None:
+    """Put the states of environments back; why not all can be, or None."""
+    problems = [env.env_method("load_state", state, indices=i)[0] for i, state in enumerate(states)]
+    return next((problem for problem in problems if problem), None)
+
+
+def _remove(path: Path) -> None:
+    """Whatever it is, if it is there and can be removed."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 class _CheckpointCallback(BaseCallback):
@@ -365,6 +427,9 @@ class _CheckpointCallback(BaseCallback):
         if len(self.curve) > self._n_saved:
             assert isinstance(self.model, SACAux)
             self.store.save(self.model, self.curve)
+            if self.model.use_sde:
+                # A training that goes on from here draws the noise of this rollout first; so does this one.
+                self.model.actor.reset_noise(self.training_env.num_envs)
             self._n_saved = len(self.curve)
 
     def _on_step(self) -> bool:
