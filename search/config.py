@@ -32,7 +32,7 @@ VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVe
 # What AuxLossSampler takes, under the same names.
 SAMPLER_KEYS = (
     *("population_size", "n_random", "n_prior", "parents", "replacement", "crossover", "horizon_change", "random"),
-    *("max_horizon", "operators", "allow_duplicates", "screening", "seed"),
+    *("max_horizon", "operators", "allow_duplicates", "screening", "retries", "seed"),
 )
 
 
@@ -108,6 +108,7 @@ class SearchConfig:
     :param operators: As in ``AuxLossSampler``
     :param allow_duplicates: As in ``AuxLossSampler``
     :param screening: As in ``AuxLossSampler``
+    :param retries: As in ``AuxLossSampler``
     :param seed: Seed of the evolution
     :param seeds: Training seeds of every candidate, whose score is the mean over them
     :param pruner: One of ``PRUNERS``
@@ -135,6 +136,7 @@ class SearchConfig:
     operators: tuple[str, ...] | None = None
     allow_duplicates: bool = False
     screening: int = 1
+    retries: int = 10
     seed: int = 0
     seeds: tuple[int, ...] = (0,)
     pruner: str = "none"
