@@ -1,7 +1,9 @@
 """The objective of a search: train one candidate, report its learning curve, return the area under it (AULC)."""
 
 import contextlib
+import errno
 import hashlib
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,19 +13,36 @@ import numpy as np
 import optuna
 import torch as th
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
+from optuna.study import StudyDirection
+from optuna.trial import TrialState
 from stable_baselines3.common.utils import get_device
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation
+from search.checkpoint import is_disk_error
 from search.config import SearchConfig
 from search.provenance import commit, cpu
-from search.space import suggest_aux_loss
+from search.space import distributions, suggest_aux_loss
 from search.storage import study_id
 from search.training import TrainingError, train_candidate
+
+# The words of SQLite and PostgreSQL for a disk that cannot be written.
+DISK_MESSAGES = (
+    "database or disk is full",
+    "disk I/O error",
+    "attempt to write a readonly database",
+    os.strerror(errno.ENOSPC),
+)
+# How PyTorch says it, which has no exception of its own for the CPU.
+MEMORY_MESSAGES = ("can't allocate memory", "not enough memory", "out of memory", "ALLOC_FAILED")
 
 
 class CandidateFailed(RuntimeError):
     """A candidate could not be trained; the trial fails with the user attribute ``reason``, the study goes on."""
+
+
+class DiskError(OSError):
+    """The disk is full, or cannot be written; the message says where, and what to do."""
 
 
 class Objective:
@@ -36,7 +55,8 @@ class Objective:
 
     User attributes of a trial: ``loss`` (notation), ``canonical``, ``environment``, ``commit``, ``device`` (name of the GPU
     or the processor), ``threads``; ``curve`` (a list of [environment steps, mean, standard deviation] over the episodes
-    of all seeds) and ``seconds`` of training when it ends; ``reason`` when it fails; ``interrupted`` when Ctrl-C stopped it.
+    of all seeds) and ``seconds`` of training when it ends; ``reason`` when it fails; ``interrupted`` when Ctrl-C or a full
+    disk stopped it.
 
     ``study.optimize(objective, catch=CandidateFailed)`` goes on after a candidate that failed.
 
@@ -49,6 +69,7 @@ class Objective:
         self.config = config
         self.folder = Path(folder)
         self.commit = commit()
+        self._checked: tuple[Any, int] | None = None
 
     def __call__(self, trial: optuna.Trial) -> float:
         """
@@ -56,8 +77,14 @@ class Objective:
         :return: Mean AULC over the seeds
         :raises optuna.TrialPruned: for an invalid candidate, before anything is trained, and for a pruned one
         :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
+        :raises DiskError: when the disk is full; the trial's candidate goes on from its last checkpoint in another trial
+        :raises ValueError: when the study is another one, see :func:`check_study`
         """
-        with end_noted(trial):
+        study = trial.study
+        if self._checked != (study._storage, study._study_id):
+            check_study(study, self.config)
+            self._checked = (study._storage, study._study_id)
+        with end_noted(trial, self.folder):
             loss = suggest_aux_loss(trial, self.config.max_horizon, self.config.operators)
             return self._train(trial, loss, self.config.environment, self.config.seeds, {}, None)
 
@@ -84,7 +111,7 @@ class Objective:
         :raises optuna.TrialPruned: when the pruner says so
         :raises CandidateFailed: as above
         """
-        with end_noted(trial):
+        with end_noted(trial, self.folder):
             return self._train(trial, aux_loss, environment, seeds, overrides or {}, name)
 
     def _train(
@@ -146,24 +173,124 @@ class Objective:
 
 
 @contextlib.contextmanager
-def end_noted(trial: optuna.Trial) -> Iterator[None]:
+def end_noted(trial: optuna.Trial, folder: Path | None = None) -> Iterator[None]:
     """
     Note why a training ended before its time, as the user attribute ``interrupted`` or ``reason``.
 
-    Ctrl-C is not the candidate's fault, whenever it comes: the sampler gives the same one out again.
+    Ctrl-C and a full disk are not the candidate's fault, whenever they come: the sampler gives the same one out again.
 
     :param trial: The training's trial
+    :param folder: Where the training writes
     :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
+    :raises DiskError: when something could not be written
     """
     try:
         yield
     except KeyboardInterrupt:
-        trial.set_user_attr("interrupted", True)
+        _note_interruption(trial)
         raise
-    except (TrainingError, MemoryError, th.cuda.OutOfMemoryError) as error:
-        reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
+    except Exception as error:
+        problem = disk_problem(error, folder)
+        if problem is not None:
+            _note_interruption(trial)
+            raise DiskError(problem) from error
+        reason = memory_problem(error) or (str(error) if isinstance(error, TrainingError) else None)
+        if reason is None:
+            raise
         trial.set_user_attr("reason", reason)
         raise CandidateFailed(reason) from error
+
+
+def _note_interruption(trial: optuna.Trial) -> None:
+    # The storage may lie on the same full disk: a trial that stays as it is counts as one of a worker that died.
+    with contextlib.suppress(Exception):
+        trial.set_user_attr("interrupted", True)
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """The error, what it was raised from or during, and so on."""
+    following: BaseException | None = error
+    while following is not None:
+        yield following
+        following = following.__cause__ or (None if following.__suppress_context__ else following.__context__)
+
+
+def disk_problem(error: BaseException, folder: Path | None = None) -> str | None:
+    """
+    One line if a disk that is full or cannot be written is behind an error: where, and what to do. None for other errors.
+
+    :param error: The error, of a training or a storage
+    :param folder: Named where the error does not say what file it was
+    """
+    for cause in _causes(error):
+        if isinstance(cause, DiskError):
+            return str(cause)
+        what, file = None, None
+        if isinstance(cause, OSError) and is_disk_error(cause):
+            what, file = cause.strerror, cause.filename
+        elif any(message in str(cause) for message in DISK_MESSAGES):
+            what = " ".join(str(cause).split())[:200]
+        if what is not None:
+            where = file or f"{folder or 'the folder of the search'}, or the storage"
+            return f"{where}: {what}. Free or mend the disk; the same command goes on where this one stopped"
+    return None
+
+
+def memory_problem(error: BaseException) -> str | None:
+    """
+    One line if an error says that memory ran out, with how much was asked for where that is known. None for other errors.
+
+    :param error: The error
+    """
+    for cause in _causes(error):
+        if (
+            isinstance(cause, (MemoryError, th.cuda.OutOfMemoryError))
+            or (isinstance(cause, OSError) and cause.errno == errno.ENOMEM)
+            or (isinstance(cause, RuntimeError) and any(message in str(cause) for message in MEMORY_MESSAGES))
+        ):
+            text = " ".join(str(cause).split())[:300]
+            size = re.search(r"allocate ([0-9]+\.?[0-9]*) (bytes|[KMGTPE]iB)", text, re.IGNORECASE)
+            asked = ""
+            if size is not None:
+                unit = ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB").index(size[2])
+                asked = f" ({float(size[1]) * 1024.0 ** (unit - 3):,.2f} GiB were asked for)"
+            return f"out of memory{asked}: {text if isinstance(cause, TrainingError) else f'{type(cause).__name__}: {text}'}"
+    return None
+
+
+def check_study(study: optuna.Study, config: SearchConfig) -> None:
+    """
+    Refuse a study that is not a search of the configuration's losses, such as one of the same name for other purposes.
+
+    It reads only: what is refused stays as it is.
+
+    :param study: The study
+    :param config: The search
+    :raises ValueError: naming what differs
+    """
+    problem = None
+    if study.directions != [StudyDirection.MAXIMIZE]:
+        problem = f"its directions are {[direction.name.lower() for direction in study.directions]}, not to maximize one score"
+    expected = distributions(config.max_horizon, config.max_horizon, config.operators)
+    for trial in study.get_trials(deepcopy=False) if problem is None else ():
+        there = trial.distributions
+        # What both have comes first: of a longer horizon, not the tokens that it brings.
+        for name in sorted(there, key=lambda name: name not in expected):
+            if there[name] != expected.get(name):
+                wanted = f"here it is {expected[name]}" if name in expected else "there is none of this name here"
+                problem = f"trial {trial.number} has the parameter {name!r}, {there[name]}; {wanted}"
+                break
+        else:
+            missing = expected.keys() & {"horizon", "operator", "negatives"} - there.keys()
+            if trial.state == TrialState.COMPLETE and missing:
+                problem = f"trial {trial.number} has no parameter {min(missing)!r}"
+        if problem is not None:
+            break
+    if problem is not None:
+        raise ValueError(
+            f"study {study.study_name!r} is not this search: {problem}. Another search needs a file of another name, or "
+            "another storage"
+        )
 
 
 def device_name(device: str) -> str:
