@@ -1,7 +1,9 @@
 """Configurations of searches and hyper-parameters: plain YAML, read with a safe loader, checked before anything runs."""
 
 import contextlib
+import copy
 import difflib
+import functools
 import inspect
 import math
 import re
@@ -19,13 +21,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_aarl import SACAux, catalog
-from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.aux_loss import LONGEST_HORIZON, AuxLoss
 from sb3_aarl.encoders import encoder_class
 from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env, wrap_env
 from sb3_aarl.policies import SACAuxPolicy
 
-# Values in a file, aliases written out.
+# Values in a file, aliases written out; and numbers of candidates, stages and the like.
 LARGEST = 100_000
+# Characters of a file, which PyYAML reads in a second, and of an error.
+LONGEST_FILE = 200_000
+LONGEST_ERROR = 1000
 PRUNERS = ("none", "median", "hyperband")
 # How several environments run, under the names of RL-Zoo's option --vec-env.
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
@@ -37,7 +42,15 @@ SAMPLER_KEYS = (
 
 
 class ConfigError(ValueError):
-    """A configuration cannot be used; one line that names the file, the key and what is wrong with it."""
+    """
+    A configuration cannot be used; one line that names the file, the key and what is wrong with it.
+
+    :param problem: The line. What in it cannot be printed, such as a terminal's control characters, is written out
+    """
+
+    def __init__(self, problem: str):
+        line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in problem)
+        super().__init__(line if len(line) <= LONGEST_ERROR else f"{line[:LONGEST_ERROR]}...")
 
 
 @dataclass(frozen=True)
@@ -267,6 +280,7 @@ def resolve_env_id(name: str) -> str:
     # Not gym.spec or gym.make, which import what stands before a colon.
     if name in gym.registry:
         return name
+    name = name[:100]
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
     nearest = difflib.get_close_matches(name, known, cutoff=0.4)
     raise ValueError(f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}")
@@ -287,7 +301,23 @@ def merge(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any
 
 
 class _Loader(yaml.SafeLoader):
-    """Also reads ``1e-3`` as a number, which is text in YAML 1.1, and refuses a key that is there twice."""
+    """
+    Also reads ``1e-3`` as a number, which is text in YAML 1.1, refuses a key that is there twice, and merge keys (``<<``)
+    that would make very much of little.
+    """
+
+    n_merged = 0
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        for key, value in node.value:
+            if key.tag == "tag:yaml.org,2002:merge":
+                for merged in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+                    if isinstance(merged, yaml.MappingNode):
+                        self.flatten_mapping(merged)
+                        self.n_merged += len(merged.value)
+                        if self.n_merged > LARGEST:
+                            raise yaml.constructor.ConstructorError(None, None, "merges too much", node.start_mark)
+        super().flatten_mapping(node)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.value != "<<")
@@ -306,34 +336,50 @@ def _read(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file."""
     try:
         with path.open(encoding="utf-8") as file:
-            values = yaml.load(file, _Loader)
+            text = file.read(LONGEST_FILE + 1)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:  # no text, or no name of a file
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    if len(text) > LONGEST_FILE:
+        raise ConfigError(f"{path}: has more than {LONGEST_FILE} characters")
+    try:
+        return copy.deepcopy(_parse(text))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+@functools.lru_cache(maxsize=8)  # a search asks for the hyper-parameters of each environment and each baseline
+def _parse(text: str) -> dict[str, Any]:
+    """The mapping in a text of YAML."""
+    try:
+        values = yaml.load(text, _Loader)
     except Exception as error:  # beside YAMLError, PyYAML lets through whatever goes wrong with a value: 2020-13-45, !!int ""
-        raise ConfigError(f"{path}: not YAML of plain values: {' '.join(str(error).split())}") from None
+        problem = " ".join(str(error).split()).replace('in "<unicode string>", ', "")
+        raise ConfigError(f"not YAML of plain values: {problem}") from None
     if not isinstance(values, dict):
-        raise ConfigError(f"{path}: must hold a mapping, not {reprlib.repr(values)}")
+        raise ConfigError(f"must hold a mapping, not {reprlib.repr(values)}")
     try:
         size = _size(values, {})
     except RecursionError:
         size = math.inf
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}") from None
     if size > LARGEST:
-        raise ConfigError(f"{path}: an alias refers to itself, or the file is too large with all of them written out")
+        raise ConfigError("an alias refers to itself, or the file is too large with all of them written out")
     return values
 
 
 def _size(value: Any, known: dict[int, float]) -> float:
     """How many values there are if aliases are written out; refuses what is not plain."""
+    if isinstance(value, int) and abs(value) >= 1e300:
+        raise ConfigError("a number has more than 300 digits")
     if value is None or isinstance(value, (str, int, float)):
         return 1
     if isinstance(value, dict):
         for key in value:
             if not isinstance(key, str):
-                raise ValueError(f"keys are text, {reprlib.repr(key)} is not")
+                raise ConfigError(f"keys are text, {reprlib.repr(key)} is not")
     elif not isinstance(value, list):
-        raise ValueError(f"{reprlib.repr(value)} is no plain value, but a {type(value).__name__}")
+        raise ConfigError(f"{reprlib.repr(value)} is no plain value, but a {type(value).__name__}")
     if id(value) not in known:
         known[id(value)] = math.inf  # as long as we are inside of it
         known[id(value)] = 1 + sum(_size(item, known) for item in (value.values() if isinstance(value, dict) else value))
@@ -341,6 +387,7 @@ def _size(value: Any, known: dict[int, float]) -> float:
 
 
 def _unknown(key: str, known: Iterable[str]) -> str:
+    key = key[:100]
     return f"unknown key {key!r}, nearest known key: {difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]!r}"
 
 
@@ -396,6 +443,8 @@ def _convert(value: Any, hint: Any, where: str, folder: Path) -> Any:
         return [_convert(item, arguments[0], f"{where}[{i}]", folder) for i, item in enumerate(value)]
     elif (kind or hint) in (dict, Mapping) and isinstance(value, dict):
         return {key: _convert(item, (*arguments, Any, Any)[1], f"{where}.{key}", folder) for key, item in value.items()}
+    if not _describe(hint):  # a class, a function
+        raise ConfigError(f"{where} can be set in Python only, not to {reprlib.repr(value)}")
     raise ConfigError(f"{where} must be {_describe(hint)}, not {reprlib.repr(value)}")
 
 
@@ -405,7 +454,7 @@ def _describe(hint: Any) -> str:
         return " or ".join(dict.fromkeys(_describe(argument) for argument in get_args(hint) if _is_plain(argument)))
     if get_origin(hint) in (tuple, list):
         return f"a list of {' and '.join(_describe(item) for item in get_args(hint) if item is not ...)}"
-    return names.get(hint, "a mapping")
+    return names.get(hint, "a mapping" if _is_plain(hint) or is_dataclass(hint) else "")
 
 
 def _is_plain(hint: Any) -> bool:
@@ -475,6 +524,10 @@ def _check(config: SearchConfig, where: str) -> None:
 
     check(config.pruner in PRUNERS, f"pruner must be one of {', '.join(PRUNERS)}, not {config.pruner!r}")
     check(config.evaluation_episodes > 0, f"evaluation_episodes must be at least 1, not {config.evaluation_episodes}")
+    for name in ("stages", "population_size", "n_random", "n_prior", "screening", "evaluation_episodes"):
+        check(getattr(config, name) <= LARGEST, f"{name} must be at most {LARGEST}, not {getattr(config, name)}")
+    check(config.max_horizon <= LONGEST_HORIZON, f"max_horizon must be at most {LONGEST_HORIZON}, not {config.max_horizon}")
+    check(config.seed >= 0, f"seed must not be negative, but is {config.seed}")
     try:
         AuxLossSampler(**config.sampler_settings())
     except ValueError as error:
@@ -486,8 +539,8 @@ def _check(config: SearchConfig, where: str) -> None:
     check(config.cross_validation is None or config.cross_validation.top > 0, "cross_validation.top must be at least 1")
     seeds = {"seeds": config.seeds} | {f"{name}.seeds": part.seeds for name, part in parts.items() if part}
     for name, numbers in seeds.items():
-        good = len(set(numbers)) == len(numbers) > 0 and min(numbers) >= 0
-        check(good, f"{name} must be different numbers that are not negative, not {list(numbers)}")
+        good = len(set(numbers)) == len(numbers) > 0 and min(numbers) >= 0 and max(numbers) < 2**32
+        check(good, f"{name} must be different numbers from 0 to 2**32 - 1, not {reprlib.repr(list(numbers))}")
     names = [baseline.name for baseline in config.baselines]
     check(len(set(names)) == len(names), f"two baselines have one name: {', '.join(names)}")
 
@@ -497,6 +550,7 @@ def _check(config: SearchConfig, where: str) -> None:
         environments["cross_validation.checkpoints"] = tuple(config.cross_validation.checkpoints)
     for key, env_ids_ in environments.items():
         check(bool(env_ids_) or key.endswith("checkpoints"), f"{key} must name at least one environment")
+        check(len(set(env_ids_)) == len(env_ids_), f"{key} must name each environment once")
         for env_id in env_ids_:
             try:
                 full = resolve_env_id(env_id)
