@@ -60,7 +60,7 @@ def key(tmp_path_factory: pytest.TempPathFactory) -> Iterator[bytes]:
 def processes() -> multiprocessing.context.ForkServerContext:
     """Processes that begin with everything imported."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["search.training"])
+    context.set_forkserver_preload(["search.training", "torch._dynamo"])  # which the first optimizer imports
     return context
 
 
