@@ -1,7 +1,7 @@
 """
 Hostile input, made at random out of what is real: only documented errors may come of it, and nothing may be executed.
 
-    python benchmarks/fuzz.py checkpoint --inputs 100000
+    python benchmarks/fuzz.py checkpoint --inputs 100000  # or notation, config
 """
 
 import base64
@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import torch as th
 import typer
+from fuzz_texts import configurations, notations
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -231,7 +232,11 @@ def checkpoints(folder: Path, marker: Path) -> Attempt:
     return attempt
 
 
-TARGETS: dict[str, Callable[[Path, Path], Attempt]] = {"checkpoint": checkpoints}
+TARGETS: dict[str, Callable[[Path, Path], Attempt]] = {
+    "checkpoint": checkpoints,
+    "notation": notations,
+    "config": configurations,
+}
 
 
 def main(

@@ -317,6 +317,8 @@ class _Loader(yaml.SafeLoader):
                         self.n_merged += len(merged.value)
                         if self.n_merged > LARGEST:
                             raise yaml.constructor.ConstructorError(None, None, "merges too much", node.start_mark)
+                    if merged.tag != "tag:yaml.org,2002:map":  # PyYAML passes over it where it is a mapping
+                        raise yaml.constructor.ConstructorError(None, None, f"merges a {merged.tag}", merged.start_mark)
         super().flatten_mapping(node)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
