@@ -182,15 +182,17 @@ def search(
         where = storage or str(path)
         launch: Launch | None = None
         if launcher == "ray" and workers != 0:
-            from search.ray_launcher import RayPool, check_storage
+            from search.ray_launcher import RayPool
 
-            check_storage(where, ray_address)
+            if threads is not None:
+                raise ValueError("--threads is for workers of this machine: with Ray, say --cpus-per-trial")
             launch = partial(
                 RayPool,
                 n_workers=workers,
                 cpus_per_trial=cpus_per_trial,
                 gpus_per_trial=gpus_per_trial,
                 address=ray_address,
+                storage=where,
             )
         elif workers != 0:
             launch = partial(WorkerPool, n_workers=workers or 1, threads=threads)

@@ -138,3 +138,9 @@ def test_an_unknown_study_is_one_line(config: Path, tmp_path: Path) -> None:
         process = start("worker", "--storage", where, "--study", name, folder=tmp_path)
         output, _ = process.communicate(timeout=60)
         assert process.returncode == 2 and problem in output and "Traceback" not in output, output
+
+
+def test_a_search_on_ray(config: Path, tmp_path: Path) -> None:
+    output = aarl("search", config, "--launcher", "ray", "--workers", 2, "--cpus-per-trial", 0.5, folder=tmp_path)
+    assert "stage 2: 4/4 done" in output
+    assert complete(str(tmp_path / "runs/tiny")) == [(stage, place) for stage in (1, 2) for place in range(4)]
