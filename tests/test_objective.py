@@ -528,7 +528,7 @@ def test_pruners_of_a_configuration(tmp_path: Path) -> None:
     ("failure", "reason"),
     [
         ("raise", "RuntimeError: the simulator exploded"),
-        ("memory", "MemoryError: no memory left"),
+        ("memory", "out of memory: MemoryError: no memory left"),
         ("diverge", "NonFiniteError: observation from the environment is not finite at agent step 31 (index [0, 0])"),
     ],
 )
