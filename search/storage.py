@@ -134,13 +134,14 @@ _attempts = _Attempts()
 _away: dict[str, object] = {}  # servers that are waited for, so that many threads log it once
 
 
-def outlast(call: Callable[[], T], is_lost: Callable[[Exception], bool], patience: float, server: str) -> T:
+def outlast(call: Callable[[], T], is_lost: Callable[[Exception], bool], patience: Callable[[], float], server: str) -> T:
     """
     Repeat a call until the server answers.
 
     :param call: The call
     :param is_lost: Whether an exception says that the server cannot be reached
-    :param patience: Seconds to go on trying after the first failure; 0 for one attempt
+    :param patience: Gives the seconds to go on trying after the first failure, 0 for one attempt; asked each time, for it
+        may change while the call waits
     :param server: Its name in messages, without a password
     :raises ServerLost: when time is up
     """
@@ -156,16 +157,16 @@ def outlast(call: Callable[[], T], is_lost: Callable[[Exception], bool], patienc
             except Exception as error:
                 if not is_lost(error):
                     raise
-                now = time.monotonic()
+                now, seconds = time.monotonic(), patience()
                 if began is None:
                     began = now
-                    if patience and _away.setdefault(server, token) is token:
-                        logger.warning("Cannot reach %s, trying again for %.0f s: %s", server, patience, _reason(error))
-                if now - began >= patience:
-                    tried_for = f", tried for {now - began:.0f} s" if patience else ""
+                    if seconds and _away.setdefault(server, token) is token:
+                        logger.warning("Cannot reach %s, trying again for %.0f s: %s", server, seconds, _reason(error))
+                if now - began >= seconds:
+                    tried_for = f", tried for {now - began:.0f} s" if now > began else ""
                     raise ServerLost(f"cannot reach {server}{tried_for}: {_reason(error)}") from None
                 _attempts.lost.append((tried, datetime.now()))
-                time.sleep(min(pause, began + patience - now))
+                time.sleep(min(pause, began + seconds - now))
                 pause = min(2 * pause, PAUSES[1])
             else:
                 if began is not None and _away.pop(server, None) is not None:
@@ -182,8 +183,10 @@ def _outlasting(method: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(method)
     def call(storage: "Outlasting", *arguments: Any, **keywords: Any) -> Any:
-        # What a late sign of life says is no longer true, and the end of a trial waits for the thread that gives them.
-        patience = min(storage.patience, storage.heartbeat_interval) if method.__name__ == "_beat" else storage.patience
+        def patience() -> float:
+            # What a late sign of life says is no longer true, and the end of a trial waits for the thread that gives them.
+            return min(storage.patience, storage.heartbeat_interval) if method.__name__ == "_beat" else storage.patience
+
         return outlast(lambda: method(storage, *arguments, **keywords), storage.is_lost, patience, storage.server)
 
     return call
@@ -483,10 +486,10 @@ def open_storage(
             return _open_journal(where, create, heartbeat_interval)
         if where.startswith("grpc:"):
             proxy = _make_proxy(where, heartbeat_interval)
-            outlast(proxy.check, proxy.is_lost, patience, proxy.server)
+            outlast(proxy.check, proxy.is_lost, lambda: patience, proxy.server)
             return proxy
         url = _parse_url(where)
-        return outlast(lambda: _open_database(url, create, heartbeat_interval), _is_lost, patience, str(url))
+        return outlast(lambda: _open_database(url, create, heartbeat_interval), _is_lost, lambda: patience, str(url))
     except ServerLost as error:
         raise ValueError(str(error)) from None
     except Exception as error:  # whatever a driver raises
@@ -650,7 +653,7 @@ def without_password(text: str) -> str:
     :param text: A URL, a connection string, or a message with such in it
     :return: The same with the passwords replaced by ``***``
     """
-    text = re.sub(r"(://[^:/@\s]*):\S*@", r"\1:***@", text)
+    text = re.sub(r"(:/+[^:/@\s]*):\S*@", r"\1:***@", text)
     return re.sub(r"(?i)((?:password|passwd|pwd)\s*=\s*)('(?:[^'\\]|\\.)*'|[^&\s]*)", r"\1***", text)
 
 

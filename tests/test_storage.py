@@ -1,5 +1,7 @@
-"""Storages: what a kill leaves behind in a journal, and passwords that nobody may read."""
+"""Storages: what a kill leaves behind in a journal, files of strangers, and passwords that nobody may read."""
 
+import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 
 import optuna
@@ -36,6 +38,72 @@ def test_looking_makes_no_storage(where: str, tmp_path: Path, monkeypatch: pytes
     assert optuna.get_all_study_names(open_storage(where, create=False)) == ["there"]
 
 
+def other_version(revision: str) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        open_storage(f"sqlite:///{path}").create_new_study([optuna.study.StudyDirection.MAXIMIZE], "study")
+        with sqlite3.connect(path) as connection:
+            connection.execute("UPDATE alembic_version SET version_num = ?", (revision,))
+
+    return write
+
+
+def table(path: Path) -> None:
+    with sqlite3.connect(path) as connection:
+        connection.execute("CREATE TABLE history (page TEXT)")
+
+
+@pytest.mark.parametrize(
+    ("where", "write", "message"),
+    [
+        ("own.log", lambda path: path.write_bytes(b"\x7fELF\x00\xff"), "no journal of Optuna"),
+        ("own.log", lambda path: path.write_text("step,return\n1,2\n"), "no journal of Optuna"),
+        ("own.log", lambda path: path.write_text('[{"op_code":0}]\n'), "no journal of Optuna"),
+        ("own.log", lambda path: path.write_text('{"op_code":99,"worker_id":"w"}\n'), "no journal of Optuna 5"),
+        ("own.log", lambda path: path.write_text('{"op_code":0,"worker_id":"w"}\n'), "no journal of Optuna 5"),
+        ("own.log", lambda path: path.write_text('{"op_code":5 and so on\n{}\n'), "no journal of Optuna 5"),
+        ("own.log", Path.mkdir, "is no file"),
+        ("own.csv", lambda path: path.write_text("step,return\n1,2\n"), "neither a folder nor a journal"),
+        ("sqlite:///own.db", lambda path: path.write_bytes(b"\x7fELF\x00\xff" * 100), "file is not a database"),
+        ("sqlite:///own.db", table, "something else than Optuna's studies: history"),
+        ("sqlite:///own.db", other_version("v0.9.0.a"), "optuna storage upgrade"),
+        ("sqlite:///own.db", other_version("v99.0.0.a"), "try updating optuna"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else None,
+)
+@pytest.mark.parametrize("create", [True, False], ids=["create", "look"])
+def test_what_is_no_storage_is_refused_and_not_touched(
+    where: str, write: Callable[[Path], None], message: str, create: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path(where.rpartition("/")[2])
+    write(path)
+    before = path.is_file() and path.read_bytes()
+    with pytest.raises(ValueError, match=message if create or "history" not in message else "no studies") as error:
+        open_storage(where, create=create)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+    assert (path.is_file() and path.read_bytes()) == before
+
+
+@pytest.mark.parametrize("where", ["own.log", "sqlite:///own.db"])
+def test_an_empty_file_holds_nothing_to_look_at_but_may_be_filled(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path(where.rpartition("/")[2])
+    path.touch()  # a worker that was killed in its first moment
+    with pytest.raises(ValueError, match=r"is empty|no studies"):
+        open_storage(where, create=False)
+    assert path.stat().st_size == 0
+    optuna.create_study(study_name="there", storage=open_storage(where))
+    assert optuna.get_all_study_names(open_storage(where, create=False)) == ["there"]
+
+
+def test_a_folder_may_be_called_like_a_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    open_storage("sqlite-study")
+    assert (tmp_path / "sqlite-study" / JOURNAL).exists()
+
+
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
@@ -44,6 +112,13 @@ def test_looking_makes_no_storage(where: str, tmp_path: Path, monkeypatch: pytes
         ("postgresql:///db?host=h&password=secret&user=me", "postgresql:///db?host=h&password=***&user=me"),
         ("sqlite:///study.db", "sqlite:///study.db"),
         ("redis://:secret@host", "redis://:***@host"),
+        ("postgresql+psycopg://me:se@cr@et@host/db", "postgresql+psycopg://me:***@host/db"),
+        ("postgresql://me:s%40cret%3A@host:5432/db?sslmode=require", "postgresql://me:***@host:5432/db?sslmode=require"),
+        ("connect with host=h password=secret user=me", "connect with host=h password=*** user=me"),
+        ("password = 'sec ret\\' it' host=h", "password = *** host=h"),
+        ("PGPASSWORD=secret aarl", "PGPASSWORD=*** aarl"),
+        ("postgresql:/me:secret@host", "postgresql:/me:***@host"),
+        ("grpc://127.0.0.1:13000", "grpc://127.0.0.1:13000"),
         ("http://localhost:8080/a@b", "http://localhost:***@b"),  # rather too much
     ],
 )
