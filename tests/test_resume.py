@@ -28,7 +28,7 @@ from search.checkpoint import CheckpointError, opened, seal, user_key
 from search.training import train_candidate
 
 LOSS = "{s_t, a_t} -> {s_t+1}"
-STEPS = 200
+STEPS = 150
 HYPER: dict[str, Any] = {
     "env_kwargs": {},
     "buffer_size": 1000,
@@ -38,7 +38,7 @@ HYPER: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8, "width": 8}},
     "device": "cpu",
 }
-# Episodes of 50, 125 and 200 agent steps; a checkpoint every 40.
+# Episodes of 50, 125 and 200 agent steps; a checkpoint every 30.
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "reacher": ("dm_control/reacher-easy-v0", {"env_kwargs": {"action_repeat": 20}}),
     "two-cheetahs": ("dm_control/cheetah-run-v0", {"env_kwargs": {"action_repeat": 8}, "n_envs": 2, "gradient_steps": -1}),
@@ -72,7 +72,7 @@ def arguments_of(case: str, folder: Path, **changes: Any) -> dict[str, Any]:
         "aux_loss": LOSS,
         "hyperparameters": HYPER | hyper,
         "seed": 1,
-        "checkpoints": [steps * repeat for steps in range(40, STEPS + 1, 40)],
+        "checkpoints": [steps * repeat for steps in range(30, STEPS + 1, 30)],
         "evaluation_episodes": 1,
         "folder": folder,
         "keep_model": True,
@@ -299,7 +299,7 @@ def test_what_others_wrote_is_not_unpickled(
     if signed:
         (saved / "manifest").unlink()
         seal(saved, bytes(32), {"cut_off": None})
-    arguments = arguments_of("pendulum", folder, checkpoints=[40, 80, 120, 160, 200])
+    arguments = arguments_of("pendulum", folder, checkpoints=[30, 60, 90, 120, 150])
 
     def no_training(*args: Any, **kwargs: Any) -> None:
         raise KeyboardInterrupt
