@@ -91,6 +91,11 @@ class Postgres:
                     raise RuntimeError(self._log()) from None
                 time.sleep(0.05)
 
+    @property
+    def pid(self) -> int:
+        """Number of the server's first process."""
+        return self._process.pid
+
     def stop(self, crash: bool = False) -> None:
         """
         Stop the server, whoever is connected.
