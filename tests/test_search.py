@@ -78,10 +78,10 @@ def wait_for(folder: Path, process: subprocess.Popen[str], finished: int) -> Non
     raise AssertionError("the search made no progress")
 
 
-def places(folder: Path) -> dict[tuple[int, int], AuxLoss]:
-    """The loss of every filled place; each is filled once."""
+def places(folder: Path) -> dict[tuple[int, int], tuple[AuxLoss, float | None]]:
+    """The loss and the score of every filled place; each is filled once."""
     complete = [trial for trial in trials(folder) if trial.state == TrialState.COMPLETE]
-    filled = {(t.user_attrs["stage"], t.user_attrs["place"]): params_to_loss(t.params) for t in complete}
+    filled = {(t.user_attrs["stage"], t.user_attrs["place"]): (params_to_loss(t.params), t.value) for t in complete}
     assert len(filled) == len(complete)
     return filled
 
@@ -95,26 +95,26 @@ def workers_of(process: subprocess.Popen[str]) -> list[int]:
 def test_search_survives_kill_and_interrupt_and_ends_as_if_nothing_had_been(config: Path, tmp_path: Path) -> None:
     undisturbed = tmp_path / "undisturbed"
     undisturbed.mkdir()
-    aarl("search", config, "--stages", 1, folder=undisturbed)
+    aarl("search", config, "--threads", 1, folder=undisturbed)
 
-    process = start("search", config, "--workers", 2, folder=tmp_path)
+    process = start("search", config, "--workers", 2, "--threads", 1, folder=tmp_path)
     wait_for(tmp_path, process, finished=1)
     os.kill(workers_of(process)[0], signal.SIGKILL)  # one worker: the program starts another one
     wait_for(tmp_path, process, finished=2)
     os.killpg(process.pid, signal.SIGKILL)  # everything
     process.communicate()
 
-    process = start("search", config, "--workers", 2, folder=tmp_path)
+    process = start("search", config, "--workers", 2, "--threads", 1, folder=tmp_path)
     wait_for(tmp_path, process, finished=5)
     os.killpg(process.pid, signal.SIGINT)  # Ctrl-C
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130 and "Interrupted" in output and "Traceback" not in output, output
 
-    output = aarl("search", config, "--workers", 2, folder=tmp_path)
+    output = aarl("search", config, "--workers", 2, "--threads", 1, folder=tmp_path)
     assert "stage 1: 4/4 done" in output and "stage 2: 4/4 done" in output
     assert places(tmp_path).keys() == {(stage, place) for stage in (1, 2) for place in range(4)}
-    # Only the first stage: scores differ where a training went on from a checkpoint, and with them the parents.
-    assert {place: loss for place, loss in places(tmp_path).items() if place[0] == 1} == places(undisturbed)
+    # Losses and scores, to the bit: trainings that went on from a checkpoint are those that were not disturbed.
+    assert places(tmp_path) == places(undisturbed)
     for trial in trials(tmp_path):
         assert trial.state in (TrialState.COMPLETE, TrialState.FAIL)
         if trial.state == TrialState.COMPLETE:
