@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from datetime import datetime, timedelta
+from pathlib import Path
 
 import optuna
 import psutil
@@ -11,6 +12,7 @@ import pytest
 from optuna.trial import TrialState, create_trial
 
 from search import workers
+from search.storage import HEARTBEAT_KEY, open_storage
 
 
 def sleeper() -> subprocess.Popen[bytes]:
@@ -105,3 +107,20 @@ def test_failing_a_trial_that_has_finished_changes_nothing() -> None:
     assert not workers.fail(study, before, "its worker died")
     assert study.trials[0].state == TrialState.COMPLETE
     assert "reason" not in study.trials[0].user_attrs
+
+
+def test_signs_of_life_are_given_where_the_storage_keeps_them(tmp_path: Path) -> None:
+    in_memory = optuna.create_study()
+    workers.beat(in_memory, in_memory.ask()._trial_id)
+    assert in_memory.trials[0].system_attrs == {}
+    study = optuna.create_study(storage=open_storage(tmp_path, heartbeat_interval=1))
+    with pytest.warns(UserWarning, match="Heartbeat"):
+        trial = study.ask()
+    signs = []
+    for of in (study, study._storage):
+        workers.beat(of, trial._trial_id)
+        signs.append(study.trials[0].system_attrs[HEARTBEAT_KEY])
+    assert len(set(signs)) == 2
+    study.tell(trial, 1.0)
+    workers.beat(study, trial._trial_id)
+    assert study.trials[0].system_attrs[HEARTBEAT_KEY] == signs[-1]
