@@ -1,5 +1,8 @@
 """
-What many workers get out of PostgreSQL behind the gRPC proxy: an instant objective on the loss's whole space.
+What many workers get out of PostgreSQL behind the gRPC proxy: an instant objective on the loss's space.
+
+Optuna writes every parameter, that is every token of a candidate, with a call and a transaction of its own: with horizons up
+to 10 there are 37 a trial, with horizons up to 3 there are 15.
 
 Workers are processes that ask, suggest a loss and tell. AuxLossSampler and Optuna's NSGAIISampler get the same load, each in
 a database of its own. PostgreSQL (Debian's package, its settings as they come), the proxy and the workers share this machine.
@@ -34,17 +37,18 @@ from postgres import Postgres, free_port
 
 STUDY = "load"
 STARTING = 120  # seconds: a worker imports PyTorch
-SAMPLERS: dict[str, Callable[[int], BaseSampler]] = {
-    "AuxLossSampler": lambda seed: AuxLossSampler(seed=0, worker=workers.identity()),
-    "NSGAIISampler": lambda seed: NSGAIISampler(population_size=100, seed=seed),
+SAMPLERS: dict[str, Callable[[int, int], BaseSampler]] = {
+    "AuxLossSampler": lambda seed, horizon: AuxLossSampler(seed=0, max_horizon=horizon, worker=workers.identity()),
+    "NSGAIISampler": lambda seed, _: NSGAIISampler(population_size=100, seed=seed),
 }
 
 
-def work(where: str, name: str, seed: int, n_trials: int, taken: Any, start: Any, results: Any) -> None:
+def work(where: str, name: str, seed: int, n_trials: int, max_horizon: int, taken: Any, start: Any, results: Any) -> None:
     """Ask and tell until all workers together have begun enough trials; put the times of each into ``results``."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.simplefilter("ignore")  # signs of life are meant for study.optimize
-    study = optuna.load_study(study_name=STUDY, storage=open_storage(where, patience=STARTING), sampler=SAMPLERS[name](seed))
+    sampler = SAMPLERS[name](seed, max_horizon)
+    study = optuna.load_study(study_name=STUDY, storage=open_storage(where, patience=STARTING), sampler=sampler)
     seconds: list[tuple[float, float, float]] = []
     errors: list[str] = []
     start.wait()
@@ -58,7 +62,7 @@ def work(where: str, name: str, seed: int, n_trials: int, taken: Any, start: Any
             trial = study.ask()
             asked = time.perf_counter()
             try:
-                loss = suggest_aux_loss(trial)
+                loss = suggest_aux_loss(trial, max_horizon)
                 result: dict[str, Any] = {"values": 2.0 * sum(loss.target) - sum(loss.source)}
             except optuna.TrialPruned:
                 result = {"state": TrialState.PRUNED}
@@ -81,7 +85,7 @@ def cpu_seconds(pid: int) -> float:
     return total + sum(psutil.Process(pid).cpu_times()[2:4])
 
 
-def measure(name: str, n_trials: int, n_workers: int, server: Postgres) -> dict[str, Any]:
+def measure(name: str, n_trials: int, n_workers: int, max_horizon: int, server: Postgres) -> dict[str, Any]:
     """The load with one sampler."""
     url, port = server.create(name.lower()), free_port()
     where = f"grpc://127.0.0.1:{port}"
@@ -94,7 +98,7 @@ def measure(name: str, n_trials: int, n_workers: int, server: Postgres) -> dict[
     try:
         optuna.create_study(study_name=STUDY, storage=open_storage(where, patience=STARTING), direction="maximize")
         processes = [
-            context.Process(target=work, args=(where, name, seed, n_trials, taken, start, results), daemon=True)
+            context.Process(target=work, args=(where, name, seed, n_trials, max_horizon, taken, start, results), daemon=True)
             for seed in range(n_workers)
         ]
         for process in processes:
@@ -132,6 +136,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=10_000, help="of each sampler")
     parser.add_argument("--workers", type=int, default=32)
+    parser.add_argument("--max-horizon", type=int, default=10)
     parser.add_argument("--samplers", nargs="+", choices=SAMPLERS, default=list(SAMPLERS))
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
@@ -139,7 +144,7 @@ def main() -> None:
     tables = {}
     with closing(Postgres()) as server:
         for name in args.samplers:
-            tables[name] = row = measure(name, args.trials, args.workers, server)
+            tables[name] = row = measure(name, args.trials, args.workers, args.max_horizon, server)
             print(f"{name}: {row['trials_per_second']} trials/s, processor seconds {row['cpu_seconds']} of {row['seconds']}")
             for what, times in row["milliseconds"].items():
                 print(f"    {what:16} median {times['p50']:8.1f} ms   99 % {times['p99']:8.1f} ms")
@@ -150,7 +155,7 @@ def main() -> None:
             for error, count in Counter(row["errors"]).most_common(3):
                 print(f"    {count} times {error}")
     if args.out:
-        save_result(args.out, trials=args.trials, workers=args.workers, tables=tables)
+        save_result(args.out, trials=args.trials, workers=args.workers, max_horizon=args.max_horizon, tables=tables)
 
 
 if __name__ == "__main__":
