@@ -111,7 +111,7 @@ class Benchmark:
         # A run that was killed and goes on has several.
         about["sessions"] = [*_read_about(path).get("sessions", ()), provenance()]
         _write_about(path, about)
-        with end_noted(trial):
+        with end_noted(trial, path):
             run = train_candidate(
                 cell.environment,
                 loss if loss in (None, "auto") else catalog.resolve(loss),

@@ -209,7 +209,7 @@ def worker(
     storage: Annotated[
         str, typer.Option(help="Storage of the search: a URL such as postgresql://host/db or grpc://host:port, or a folder.")
     ],
-    study: Annotated[str | None, typer.Option(help="Name of the search. Default: the only one there.")] = None,
+    study: Annotated[str | None, typer.Option(help="Study of the search. Default: the only search there.")] = None,
     workers: Workers = 1,
     threads: Threads = None,
     folder: Annotated[

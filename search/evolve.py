@@ -20,7 +20,7 @@ from sb3_aarl.aux_loss import AuxLoss
 from search import grid, workers
 from search.config import SearchConfig, load_config
 from search.dashboard import annotate_study, annotate_trial, update_plots
-from search.objective import CandidateFailed, Objective, make_pruner
+from search.objective import CandidateFailed, DiskError, Objective, check_study, disk_problem, make_pruner
 from search.pool import Pool, uninterrupted
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
@@ -173,16 +173,19 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
             raise ValueError(f"{failures} candidates failed one after the other, the last one: {reason}")
 
     while True:
-        workers.fail_dead(study, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
         try:
+            workers.fail_dead(study, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
             # Without this look a worker too many would leave a trial behind that never got a place.
             if sampler.has_place(study):
-                study.optimize(objective, n_trials=1, catch=(CandidateFailed,), callbacks=[finished])
+                # Models lie in reference cycles: the next candidate needs their memory.
+                study.optimize(objective, n_trials=1, catch=(CandidateFailed,), callbacks=[finished], gc_after_trial=True)
             else:
                 time.sleep(POLL_SECONDS)
         except SearchComplete:
             return
-        except (UpdateFinishedTrialError, ValueError) as error:
+        except Exception as error:
+            if problem := disk_problem(error, folder):
+                raise DiskError(problem) from None
             # A laptop that slept: others took this worker for dead and failed its trial, whose place they give out again.
             if not (isinstance(error, UpdateFinishedTrialError) or str(error).startswith("Cannot tell a FAIL trial")):
                 raise
@@ -210,6 +213,7 @@ def search(
     study = optuna.create_study(
         study_name=config.name, storage=storage, sampler=sampler, direction="maximize", load_if_exists=True
     )
+    check_study(study, config)
     of_all = {"environment": config.environment, "seeds": config.seeds}
     grid.check_training(study, {"candidates": of_all | grid.training(config, config.environment)})
     progress = look(study, sampler)  # refuses a study that was begun with other settings of the sampler
@@ -233,7 +237,7 @@ def join(
     Work on a search that another program began, on this machine or another one, until it is complete.
 
     :param where: Its storage, as for ``open_storage``
-    :param name: Its study, None for the only one
+    :param name: Its study, None for the only search there
     :param folder: Folder of the search, None for ``runs/NAME``. Where machines share it, candidates of a worker that died
         go on from its checkpoints; else they begin anew
     :param launch: Starts the workers
@@ -241,10 +245,12 @@ def join(
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = open_storage(where, create=False)
-    name = load_study(storage, name).study_name
-    folder = folder or Path("runs") / name
-    study = load_study(storage, name)
-    sampler = AuxLossSampler(**stored_config(study, folder).sampler_settings())
+    searches = [study.study_name for study in storage.get_all_studies() if CONFIG_KEY in study.user_attrs]
+    study = load_study(storage, searches[0] if name is None and len(searches) == 1 else name)
+    folder = folder or Path("runs") / study.study_name
+    config = stored_config(study, folder)
+    check_study(study, config)
+    sampler = AuxLossSampler(**config.sampler_settings())
     yield look(study, sampler)
     yield from _fill(study, sampler, launch, folder, where, heartbeat)
 

@@ -18,9 +18,9 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_aarl.aux_loss import AuxLoss
 from search import workers
 from search.config import SearchConfig
-from search.objective import CandidateFailed, Objective
+from search.objective import CandidateFailed, DiskError, Objective, disk_problem
 from search.pool import WorkerPool
-from search.storage import open_storage, study_id
+from search.storage import PATIENCE, open_storage, study_id
 
 # How often a run is tried that fails, or whose worker dies.
 MAX_TRIES = 3
@@ -296,7 +296,7 @@ def _run_worker(grid: Runs, folder: Path, where: str) -> None:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     # Nothing is sampled, all runs are enqueued; and none is pruned, as Optuna's default would.
     study = optuna.load_study(
-        study_name=grid.name, storage=open_storage(where), sampler=RandomSampler(seed=0), pruner=NopPruner()
+        study_name=grid.name, storage=open_storage(where, patience=PATIENCE), sampler=RandomSampler(seed=0), pruner=NopPruner()
     )
 
     def objective(trial: optuna.Trial) -> float:
@@ -312,4 +312,9 @@ def _run_worker(grid: Runs, folder: Path, where: str) -> None:
         return grid.train(trial, cell, folder)
 
     while study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
-        study.optimize(objective, n_trials=1, catch=(CandidateFailed,))
+        try:
+            study.optimize(objective, n_trials=1, catch=(CandidateFailed,), gc_after_trial=True)
+        except Exception as error:
+            if problem := disk_problem(error, folder):
+                raise DiskError(problem) from None
+            raise

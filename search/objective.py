@@ -144,9 +144,13 @@ class Objective:
         def report(evaluation: Evaluation) -> bool:
             nonlocal pruned
             if not curves:
-                trial.report(evaluation.mean, evaluation.environment_steps)
-                # After the last evaluation nothing is left to spare.
-                pruned = evaluation.environment_steps != checkpoints[-1] and trial.should_prune()
+                try:
+                    trial.report(evaluation.mean, evaluation.environment_steps)
+                    # After the last evaluation nothing is left to spare.
+                    pruned = evaluation.environment_steps != checkpoints[-1] and trial.should_prune()
+                except Exception:  # of the storage: not the candidate's fault
+                    _note_interruption(trial)
+                    raise
             return not pruned
 
         scores = []

@@ -40,6 +40,17 @@ class TrainingError(RuntimeError):
     """A training failed while it ran; the message is the reason in one line."""
 
 
+class _Unrelated(BaseException):
+    """
+    What ``on_evaluation`` raised, on its way out past all that takes exceptions for the training's own.
+
+    :param error: The exception
+    """
+
+    def __init__(self, error: Exception):
+        self.error = error
+
+
 class TrainingRun(NamedTuple):
     """
     What a training gave.
@@ -117,7 +128,7 @@ def train_candidate(
     :param evaluation_episodes: Episodes of each evaluation
     :param folder: Where checkpoint and curve are kept, None to keep nothing. One training at a time in a folder
     :param on_evaluation: Called after every evaluation, and after those of a run that goes on again. Training ends early
-        if it returns False
+        if it returns False. An exception of its own is raised as it is, and the last checkpoint stays
     :param keep_model: Whether to leave the trained model as ``model.zip`` in the folder
     :param progress_bar: Whether to show a progress bar
     :raises TrainingError: when the training fails while it runs, the cause being its ``__cause__``
@@ -153,7 +164,8 @@ def train_candidate(
         ):
             try:
                 model, curve = store.load(env, settings.get("device", "auto")) if store is not None else (None, [])
-                if _repeat(curve, on_evaluation):
+                tell = None if on_evaluation is None else _set_apart(on_evaluation)
+                if _repeat(curve, tell):
                     model = model or SACAux(policy, env, **settings)
                     curve_callback = LearningCurveCallback(
                         eval_env,
@@ -161,7 +173,7 @@ def train_candidate(
                         evaluation_episodes,
                         seed=(EVALUATION_SEED + EVALUATION_SEEDS * seed) % HALF,
                         path=None if store is None else store.curve_path,
-                        on_evaluation=on_evaluation,
+                        on_evaluation=tell,
                         curve=curve,
                     )
                     curve = curve_callback.curve
@@ -169,6 +181,8 @@ def train_candidate(
                     _learn(model, agent_steps, [curve_callback, *saving], progress_bar)
                     if store is not None and keep_model:
                         store.save_model(model)
+            except _Unrelated as unrelated:
+                raise unrelated.error from unrelated.error.__cause__
             except OSError:
                 raise  # of the disk: the checkpoint waits for a better one
             except Exception:
@@ -248,6 +262,18 @@ def _closed(env: VecEnv) -> Iterator[VecEnv]:
     finally:
         with contextlib.suppress(EOFError, OSError):
             env.close()
+
+
+def _set_apart(on_evaluation: Callable[[Evaluation], bool | None]) -> Callable[[Evaluation], bool | None]:
+    """The same function, whose exceptions nobody takes for the training's."""
+
+    def tell(evaluation: Evaluation) -> bool | None:
+        try:
+            return on_evaluation(evaluation)
+        except Exception as error:
+            raise _Unrelated(error) from error
+
+    return tell
 
 
 def _repeat(curve: Sequence[Evaluation], on_evaluation: Callable[[Evaluation], bool | None] | None) -> bool:

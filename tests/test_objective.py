@@ -16,6 +16,7 @@ import optuna
 import pytest
 import yaml
 from gymnasium.utils import EzPickle
+from optuna.exceptions import StorageInternalError
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import RandomSampler
 from optuna.storages import RetryHeartbeatStaleTrialCallback
@@ -352,6 +353,26 @@ def test_a_killed_training_goes_on_from_its_checkpoint(killed: Path, tmp_path: P
     assert [point.environment_steps for point in run.curve] == list(CHECKPOINTS)
     assert all(later.seconds > earlier.seconds for earlier, later in zip(run.curve, run.curve[1:], strict=False))
     assert not (folder / "checkpoint").exists()
+
+
+def test_a_storage_that_fails_is_not_the_candidates_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    objective = make_objective(tmp_path)
+    study = make_study()
+    report, failed = optuna.Trial.report, []
+
+    def fails_once(trial: optuna.Trial, value: float, step: int) -> None:
+        if step == 1600 and not failed:
+            failed.append(step)
+            raise StorageInternalError("locked")
+        report(trial, value, step)
+
+    monkeypatch.setattr(optuna.Trial, "report", fails_once)
+    with pytest.raises(StorageInternalError, match="locked"):
+        study.optimize(objective, n_trials=1, catch=(CandidateFailed,))
+    assert study.trials[0].state == TrialState.FAIL and study.trials[0].user_attrs["interrupted"]
+    assert "reason" not in study.trials[0].user_attrs
+    (checkpoint,) = (tmp_path / "runs").rglob("checkpoint/*")
+    assert checkpoint.name == "800"
 
 
 def test_no_two_trainings_and_evaluations_begin_alike(tmp_path: Path) -> None:
