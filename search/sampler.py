@@ -132,12 +132,12 @@ class _Register:
                 attempt, deaths = attempt + 1, 0
         return attempt
 
-    def unplaced_before(self, number: int) -> list[FrozenTrial]:
-        """Trials before this one that run and may still ask for a place."""
+    def unplaced(self, before: int | None = None) -> list[FrozenTrial]:
+        """Trials, before this one, that run and may still ask for a place."""
         return [
             self.trials[other]
             for other in sorted(self.open)
-            if other < number
+            if (before is None or other < before)
             and other not in self.places
             and self.trials[other].state == TrialState.RUNNING
             and other not in self._strangers
@@ -155,7 +155,8 @@ class AuxLossSampler(BaseGASampler):
     parents and are given out while the last trials of this stage run. A worker that finds no place waits for one.
 
     The candidate of a place depends on the seed, the stage, the place and the stages before only, whichever worker
-    asks. Workers agree on places through the storage alone: trial n chooses after all trials before it have chosen.
+    asks. Workers agree on places through the storage alone: a trial leaves as many free places to those before it as have
+    none yet, and looks back after it has taken its own.
 
     :param population_size: Places of every stage but the first (paper: 100)
     :param n_random: Random losses of the first stage (paper: 100)
@@ -286,7 +287,7 @@ class AuxLossSampler(BaseGASampler):
         with self._lock:
             self._refresh(study)
             # Before the first trial chose, the seed of the study may still be open.
-            return not self._register.holders or self._first_free(study) is not None
+            return not self._register.holders or self._nth_free(study, len(self._register.unplaced())) is not None
 
     # Optuna's interface.
 
@@ -395,26 +396,30 @@ class AuxLossSampler(BaseGASampler):
             with self._lock:
                 self._refresh(study)
                 register = self._register
-                # Choosing in the order of numbers: nobody else chooses while no trial before this one is without a place.
                 # A copy of a trial whose worker died brings its place.
-                ahead = [] if trial.number in register.places else register.unplaced_before(trial.number)
-                if trial.number in register.places:
+                is_copy = trial.number in register.places
+                ahead = [] if is_copy else register.unplaced(before=trial.number)
+                free = None
+                if is_copy:
                     if not register.is_shared(trial.number):
                         return
                     self._give_back(study, trial)
-                elif not ahead:
+                elif not ahead or register.holders:  # who chooses first may bring the study's seed
                     is_given = bool(trial.params) or "fixed_params" in trial.system_attrs
-                    free = self._first_free(study, is_given)
+                    free = self._nth_free(study, len(ahead), is_given)
                     if free is not None and self._take(study, trial, *free, is_given):
                         return
                 running = [register.trials[number] for number in register.open if number != trial.number]
+            if free is not None:  # two chose the same one, and both gave way
+                time.sleep(np.random.default_rng().uniform(0.0, 0.1))  # SB3 seeds the generators of the process
+                continue
             if self.worker is not None:
                 workers.fail_dead(study, running)
             wait.pause(ahead, running)
 
-    def _first_free(self, study: Study, enqueued: bool = False) -> tuple[int, int] | None:
+    def _nth_free(self, study: Study, n: int, enqueued: bool = False) -> tuple[int, int] | None:
         """
-        The next place to give out, None if there is none now.
+        The next place to give out but ``n``, None if there is none now.
 
         A loss that the user enqueued takes a random place if there is one: no offspring is lost.
         """
@@ -422,19 +427,18 @@ class AuxLossSampler(BaseGASampler):
         stage = evolution.complete_stages(self._register) + 1
         if self.n_stages is not None and stage > self.n_stages:
             raise SearchComplete(f"all {self.n_stages} stages of the search are complete")
-        free = self._free(stage)
-        if not free and (self.n_stages is None or stage < self.n_stages):
-            stage += 1
-            free = [place for place in self._free(stage) if self.operations(stage)[place] == "random"]
+        free = [(stage, place) for place in self._free(stage)]
+        if len(free) <= n and (self.n_stages is None or stage < self.n_stages):
+            free += [(stage + 1, place) for place in self._free(stage + 1) if self.operations(stage + 1)[place] == "random"]
         if enqueued:
-            free.sort(key=lambda place: self.operations(stage)[place] != "random")
-        return (stage, free[0]) if free else None
+            free.sort(key=lambda at: self.operations(at[0])[at[1]] != "random")
+        return free[n] if n < len(free) else None
 
     def _free(self, stage: int) -> list[int]:
         return [place for place in range(len(self.operations(stage))) if not self._register.held_by(stage, place)]
 
     def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int, is_given: bool) -> bool:
-        """Take a place for a trial; False if another one did so at the same moment."""
+        """Take a place for a trial; False if another one has it too."""
         evolution = self._get_evolution(study)
         attempt = self._register.attempt(stage, place, self.retries)
         operation, parents, loss = "enqueued", [], None
@@ -444,8 +448,8 @@ class AuxLossSampler(BaseGASampler):
         storage, trial_id = study._storage, trial._trial_id
         claim = {"stage": stage, "place": place, "attempt": attempt, "seed": evolution.seed, "loss": loss}
         storage.set_trial_system_attr(trial_id, PLACE_KEY, claim)
-        # Enqueued trials, and copies of trials whose worker died, come out of turn. So everybody looks back, and gives way
-        # if he is not alone: one of two, at least, sees the other.
+        # Others may have seen other trials without a place, and choose the same one at this moment. So everybody looks back,
+        # and gives way if he is not alone: one of two, at least, sees the other.
         self._refresh(study)
         if self._register.is_shared(trial.number):
             self._give_back(study, trial)
