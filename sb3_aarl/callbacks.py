@@ -1,6 +1,7 @@
 """Learning curve at fixed environment steps, and the area under it (AULC)."""
 
 import csv
+import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -193,7 +194,7 @@ def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:
     :param curve: The evaluations
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.tmp")
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # two may write at once
     with unfinished.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(Evaluation._fields)

@@ -220,6 +220,7 @@ def worker(
         ),
     ] = None,
     heartbeat: Heartbeat = 60,
+    wait: Annotated[float, typer.Option(help="Seconds to wait for the search to be begun.", min=0)] = 0,
 ) -> None:
     """Join a search from any machine, until it is complete. It needs nothing but the storage."""
     with clear_errors():
@@ -231,7 +232,7 @@ def worker(
 
         console.print(f"Working for {without_password(storage)}", soft_wrap=True, markup=False)
         launch = partial(WorkerPool, n_workers=workers, threads=threads)
-        _show_progress(evolve.join(storage, study, folder, launch, heartbeat))
+        _show_progress(evolve.join(storage, study, folder, launch, heartbeat, wait))
 
 
 @app.command()

@@ -20,11 +20,11 @@ from sb3_aarl.aux_loss import AuxLoss
 from search import grid, workers
 from search.config import SearchConfig, load_config
 from search.dashboard import annotate_study, annotate_trial, update_plots
-from search.objective import CandidateFailed, DiskError, Objective, check_study, disk_problem, make_pruner
+from search.objective import CandidateFailed, DiskError, Objective, causes, check_study, disk_problem, make_pruner
 from search.pool import Pool, uninterrupted
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
-from search.storage import HEARTBEAT_INTERVAL, PATIENCE, load_study, open_storage
+from search.storage import HEARTBEAT_INTERVAL, PATIENCE, ServerLost, load_study, open_storage
 from search.trials import loss_of, ranked
 
 logger = logging.getLogger(__name__)
@@ -35,6 +35,8 @@ MAX_FAILURES = 10
 POLL_SECONDS = 1.0
 # Seconds between two drawings of the evolution: each stays in the storage, a hundred kilobytes for a whole search.
 PLOT_SECONDS = 300.0
+# Seconds between two looks for a search that has not been begun.
+WAIT_SECONDS = 10.0
 ARTIFACTS = "artifacts"  # folder of the pictures in notes
 # User attribute of a study: its configuration and file of hyper-parameters as text, for workers of other machines.
 CONFIG_KEY = "config"
@@ -94,6 +96,7 @@ def keep_config(study: optuna.Study, config: SearchConfig) -> None:
 
     :param study: The study
     :param config: The search
+    :raises ValueError: when the study was to have more stages, for which others may wait
     """
     hidden = {"path": None, "hyperparameters": f"{config.name}-hyperparameters.yml"}
     values = {item.name: hidden.get(item.name, getattr(config, item.name)) for item in fields(config)}
@@ -101,7 +104,12 @@ def keep_config(study: optuna.Study, config: SearchConfig) -> None:
         f"{config.name}.yml": yaml.safe_dump(_plain({key: value for key, value in values.items() if value is not None})),
         hidden["hyperparameters"]: config.hyperparameters.read_text(encoding="utf-8"),
     }
-    if study.user_attrs.get(CONFIG_KEY) != texts:
+    stored, stages = study.user_attrs.get(CONFIG_KEY), 0
+    with contextlib.suppress(yaml.YAMLError, LookupError, TypeError, ValueError):  # one of another kind is replaced
+        stages = int(yaml.safe_load((stored or {})[f"{config.name}.yml"])["stages"])
+    if stages > config.stages:
+        raise ValueError(f"study {config.name!r} was begun with {stages} stages: it may get more, not {config.stages}")
+    if stored != texts:
         study.set_user_attr(CONFIG_KEY, texts)
 
 
@@ -184,12 +192,14 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
         except SearchComplete:
             return
         except Exception as error:
+            # A laptop that slept: others took this worker for dead and failed its trial, whose place they give out again.
+            if isinstance(error, UpdateFinishedTrialError) or str(error).startswith("Cannot tell a FAIL trial"):
+                logger.warning("A trial of this worker was failed by another one meanwhile: %s", error)
+                continue
             if problem := disk_problem(error, folder):
                 raise DiskError(problem) from None
-            # A laptop that slept: others took this worker for dead and failed its trial, whose place they give out again.
-            if not (isinstance(error, UpdateFinishedTrialError) or str(error).startswith("Cannot tell a FAIL trial")):
-                raise
-            logger.warning("A trial of this worker was failed by another one meanwhile: %s", error)
+            # Optuna stumbles over what follows from it.
+            raise next((cause for cause in causes(error) if isinstance(cause, ServerLost)), error) from None
 
 
 def search(
@@ -231,7 +241,12 @@ def search(
 
 
 def join(
-    where: str, name: str | None, folder: Path | None, launch: Launch, heartbeat: int = HEARTBEAT_INTERVAL
+    where: str,
+    name: str | None,
+    folder: Path | None,
+    launch: Launch,
+    heartbeat: int = HEARTBEAT_INTERVAL,
+    wait: float = 0.0,
 ) -> Iterator[Progress]:
     """
     Work on a search that another program began, on this machine or another one, until it is complete.
@@ -242,11 +257,21 @@ def join(
         go on from its checkpoints; else they begin anew
     :param launch: Starts the workers
     :param heartbeat: As for :func:`search`
+    :param wait: Seconds to wait for the search to be begun
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = open_storage(where, create=False)
-    searches = [study.study_name for study in storage.get_all_studies() if CONFIG_KEY in study.user_attrs]
-    study = load_study(storage, searches[0] if name is None and len(searches) == 1 else name)
+    deadline = time.monotonic() + wait
+    while True:
+        try:
+            storage = open_storage(where, create=False)
+            searches = [study.study_name for study in storage.get_all_studies() if CONFIG_KEY in study.user_attrs]
+            study = load_study(storage, searches[0] if name is None and len(searches) == 1 else name)
+            break
+        except ValueError as error:
+            if time.monotonic() > deadline:
+                raise
+            logger.warning("Waiting for the search to be begun: %s", error)
+            time.sleep(min(WAIT_SECONDS, max(0.0, deadline - time.monotonic())))
     folder = folder or Path("runs") / study.study_name
     config = stored_config(study, folder)
     check_study(study, config)

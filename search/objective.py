@@ -186,7 +186,8 @@ def end_noted(trial: optuna.Trial, folder: Path | None = None) -> Iterator[None]
     :param trial: The training's trial
     :param folder: Where the training writes
     :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
-    :raises DiskError: when something could not be written
+    :raises DiskError: when the disk is full, or cannot be written
+    :raises OSError: when something else is wrong with the folder
     """
     try:
         yield
@@ -200,6 +201,8 @@ def end_noted(trial: optuna.Trial, folder: Path | None = None) -> Iterator[None]
             raise DiskError(problem) from error
         reason = memory_problem(error) or (str(error) if isinstance(error, TrainingError) else None)
         if reason is None:
+            if isinstance(error, OSError):  # of the folder, such as one on another machine that went away
+                _note_interruption(trial)
             raise
         trial.set_user_attr("reason", reason)
         raise CandidateFailed(reason) from error
@@ -211,7 +214,7 @@ def _note_interruption(trial: optuna.Trial) -> None:
         trial.set_user_attr("interrupted", True)
 
 
-def _causes(error: BaseException) -> Iterator[BaseException]:
+def causes(error: BaseException) -> Iterator[BaseException]:
     """The error, what it was raised from or during, and so on."""
     following: BaseException | None = error
     while following is not None:
@@ -226,7 +229,7 @@ def disk_problem(error: BaseException, folder: Path | None = None) -> str | None
     :param error: The error, of a training or a storage
     :param folder: Named where the error does not say what file it was
     """
-    for cause in _causes(error):
+    for cause in causes(error):
         if isinstance(cause, DiskError):
             return str(cause)
         what, file = None, None
@@ -246,7 +249,7 @@ def memory_problem(error: BaseException) -> str | None:
 
     :param error: The error
     """
-    for cause in _causes(error):
+    for cause in causes(error):
         if (
             isinstance(cause, (MemoryError, th.cuda.OutOfMemoryError))
             or (isinstance(cause, OSError) and cause.errno == errno.ENOMEM)

@@ -46,14 +46,14 @@ class Pool(Protocol):
         ...
 
 
-def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, threads: int) -> None:
+def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, threads: int, parent: int) -> None:
     """What a worker process runs."""
     # Clusters announce the end of a job with SIGTERM: there is time to put away what is there.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt_once)
     sys.unraisablehook = _interrupt_again
     th.set_num_threads(threads)
-    threading.Thread(target=_stop_with_parent, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_stop_with_parent, args=(parent,), daemon=True).start()
     try:
         target(*arguments)
     except KeyboardInterrupt:
@@ -163,7 +163,7 @@ class WorkerPool:
             taken = Counter(self._gpu_of[process] for process in self.processes)
             variables["CUDA_VISIBLE_DEVICES"] = min(self._gpus, key=lambda gpu: taken[gpu])
         with _environment(**variables):
-            process = self._context.Process(target=_work, args=self._start)
+            process = self._context.Process(target=_work, args=(*self._start, os.getpid()))
             process.start()
         self.processes.append(process)
         self._gpu_of[process] = variables.get("CUDA_VISIBLE_DEVICES", "")

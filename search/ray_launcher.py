@@ -11,8 +11,10 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import urlsplit
 
 from search.pool import INTERRUPT_SECONDS, MAX_DEATHS, WorkerError, _interrupt_again, _interrupt_once, message
+from search.storage import without_password
 
 try:
     import ray
@@ -304,7 +306,8 @@ def check_storage(where: str) -> None:
     :param where: The storage, as for :func:`search.storage.open_storage`
     :raises ValueError: naming the machines that cannot reach it
     """
-    if "://" in where and not where.startswith("sqlite"):
+    host = urlsplit(where).hostname or "" if "://" in where else ""
+    if "://" in where and not where.startswith("sqlite") and host not in ("localhost", "::1") and not host.startswith("127."):
         return
     nodes = [node for node in ray.nodes() if node["Alive"]]
     here = ray.get_runtime_context().get_node_id()
@@ -312,6 +315,6 @@ def check_storage(where: str) -> None:
     others = sorted({" ".join(machine) for machine in machines.values() if machine != machines[here]})
     if others:
         raise ValueError(
-            f"the storage {where} is on this machine, but Ray has nodes on others ({', '.join(others)}): "
+            f"the storage {without_password(where)} is on this machine, but Ray has nodes on others ({', '.join(others)}): "
             "take one that they reach, --storage postgresql://... or grpc://..."
         )

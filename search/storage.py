@@ -188,7 +188,12 @@ def _outlasting(method: Callable[..., Any]) -> Callable[..., Any]:
             # What a late sign of life says is no longer true, and the end of a trial waits for the thread that gives them.
             return min(storage.patience, storage.heartbeat_interval) if method.__name__ == "_beat" else storage.patience
 
-        return outlast(lambda: method(storage, *arguments, **keywords), storage.is_lost, patience, storage.server)
+        try:
+            return outlast(lambda: method(storage, *arguments, **keywords), storage.is_lost, patience, storage.server)
+        except ServerLost:
+            if method.__name__ != "_beat":
+                storage.patience = 0.0  # who puts away what it has shall not wait as long once more
+            raise
 
     return call
 
@@ -209,14 +214,13 @@ class _Watch:
     def __reduce__(self) -> tuple[Any, ...]:
         return _Watch, (self._gap,)  # another process has another clock
 
-    def unchanged(self, look: Callable[[], dict[int, Any]], seconds: float) -> list[int]:
+    def unchanged(self, look: Callable[[], dict[int, Any]]) -> dict[int, tuple[Any, float]]:
         """
         :param look: Reads the sign of each key
-        :param seconds: Time without a change
-        :return: The keys whose sign has not changed for so long
+        :return: The sign of each key, and for how many seconds it has not changed; empty soon after another look
         """
         if time.monotonic() - self._looked < self._gap / 20:
-            return []
+            return {}
         signs = look()
         now = time.monotonic()
         if now - self._looked > self._gap:
@@ -226,14 +230,15 @@ class _Watch:
         self._since = {
             key: known[key] if key in known and known[key][0] == sign else (sign, now) for key, sign in signs.items()
         }
-        return [key for key, (_, since) in self._since.items() if now - since >= seconds]
+        return {key: (sign, now - since) for key, (sign, since) in self._since.items()}
 
 
 class WithHeartbeat(BaseStorage, BaseHeartbeat):
     """
     A storage with signs of life: a system attribute of the trial that changes with each of them.
 
-    A trial is stale when its sign has not changed while this process watched for two intervals. No clocks are compared,
+    A trial is stale when its sign has not changed while this process watched for two intervals of the trial's own worker,
+    which the sign names. No clocks are compared,
     and nobody is blamed for a time in which the server, the network or this process stood still. So somebody has to
     look more often than once an interval, as workers do that wait for a place: as long as none waits, nobody needs the
     place of a stale trial. Trials without any sign (of a user's own ``ask``) are never stale.
@@ -251,19 +256,17 @@ class WithHeartbeat(BaseStorage, BaseHeartbeat):
             logger.warning("No sign of life could be given: %s", _reason(error))
 
     def _beat(self, trial_id: int) -> None:
-        self.set_trial_system_attr(trial_id, HEARTBEAT_KEY, time.time_ns())
+        self.set_trial_system_attr(trial_id, HEARTBEAT_KEY, [time.time_ns(), self.heartbeat_interval])
 
     def _signs(self, study_id: int) -> dict[int, Any]:
         running = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
         return {trial._trial_id: trial.system_attrs[HEARTBEAT_KEY] for trial in running if HEARTBEAT_KEY in trial.system_attrs}
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
-        return self._unchanged(study_id, 2 * self.heartbeat_interval)
-
-    def _unchanged(self, study_id: int, seconds: float) -> list[int]:
         watches: dict[int, _Watch] = vars(self).setdefault("_watches", {})
         watch = watches.setdefault(study_id, _Watch(self.heartbeat_interval))
-        return watch.unchanged(lambda: self._signs(study_id), seconds)
+        unchanged = watch.unchanged(lambda: self._signs(study_id))
+        return [trial_id for trial_id, (sign, seconds) in unchanged.items() if seconds >= 2 * sign[1]]
 
     def get_heartbeat_interval(self) -> int:
         """Seconds between two signs of life."""
@@ -334,8 +337,9 @@ class Outlasting(WithHeartbeat):
 
 class Database(Outlasting, RDBStorage):
     """
-    A database. Signs of life are Optuna's own: a trial is stale when the database's clock says so, and still does after
-    this process watched for another interval, in which a live worker would have come back from an outage.
+    A database. Beside the signs of life that workers behind a proxy see too, it has Optuna's own, for Optuna's own tools:
+    a trial that has only these is stale when the database's clock says so, and still does after this process watched for
+    two more intervals, in which a live worker would have come back from an outage.
 
     :param url: Its URL
     :param heartbeat_interval: Seconds between two signs of life
@@ -345,7 +349,7 @@ class Database(Outlasting, RDBStorage):
     heartbeat_interval: int
 
     def __init__(self, url: URL, heartbeat_interval: int = HEARTBEAT_INTERVAL, skip_table_creation: bool = False):
-        self.server = str(url)
+        self.server = without_password(str(url))
         # Ping: a connection that was lost while nobody used it costs no attempt.
         engine_kwargs = {"connect_args": _connect_args(url), "pool_size": PROXY_THREADS, "pool_pre_ping": True}
         with warnings.catch_warnings():
@@ -363,12 +367,11 @@ class Database(Outlasting, RDBStorage):
 
     def _beat(self, trial_id: int) -> None:
         RDBStorage.record_heartbeat(self, trial_id)
+        super()._beat(trial_id)
 
     def _signs(self, study_id: int) -> dict[int, Any]:
-        return dict.fromkeys(RDBStorage._get_stale_trial_ids(self, study_id))
-
-    def _get_stale_trial_ids(self, study_id: int) -> list[int]:
-        return self._unchanged(study_id, self.heartbeat_interval)
+        of_optuna = dict.fromkeys(RDBStorage._get_stale_trial_ids(self, study_id), (None, self.heartbeat_interval))
+        return of_optuna | super()._signs(study_id)
 
 
 def _is_lost(error: BaseException | None) -> bool:
@@ -490,7 +493,7 @@ def open_storage(
             outlast(proxy.check, proxy.is_lost, lambda: patience, proxy.server)
             return proxy
         url = _parse_url(where)
-        return outlast(lambda: _open_database(url, create, heartbeat_interval), _is_lost, lambda: patience, str(url))
+        return outlast(lambda: _open_database(url, create, heartbeat_interval), _is_lost, lambda: patience, shown)
     except ServerLost as error:
         raise ValueError(str(error)) from None
     except Exception as error:  # whatever a driver raises
@@ -611,7 +614,8 @@ def serve_proxy(where: str, host: str = "127.0.0.1", port: int = 13000) -> None:
     from optuna.storages._grpc.servicer import OptunaStorageProxyService
 
     if "://" not in where or where.startswith("grpc:"):
-        raise ValueError(f"a proxy serves a database, such as postgresql://user@host/database, and not {where}")
+        shown = without_password(where)
+        raise ValueError(f"a proxy serves a database, such as postgresql://user@host/database, and not {shown}")
     database = open_storage(where)
     storage = get_storage(database)
     # Optuna's cache refuses the parameters of trials that it has not seen: those that run while the proxy is restarted.
@@ -654,7 +658,7 @@ def without_password(text: str) -> str:
     :param text: A URL, a connection string, or a message with such in it
     :return: The same with the passwords replaced by ``***``
     """
-    text = re.sub(r"(:/+[^:/@\s]*):\S*@", r"\1:***@", text)
+    text = re.sub(r"(\b[a-zA-Z][\w+.-]*:/*[^:/@\s]*):\S*@", r"\1:***@", text)
     return re.sub(r"(?i)((?:password|passwd|pwd)\s*=\s*)('(?:[^'\\]|\\.)*'|[^&\s]*)", r"\1***", text)
 
 

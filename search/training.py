@@ -11,6 +11,7 @@ import os
 import pickle
 import re
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +35,7 @@ logger = logging.getLogger(__name__)
 EVALUATION_SEED = 10_000
 EVALUATION_SEEDS = 1_000_000
 HALF = 2**31
+UNFINISHED = "unfinished-"  # name of a checkpoint that is being written
 
 
 class TrainingError(RuntimeError):
@@ -42,7 +44,7 @@ class TrainingError(RuntimeError):
 
 class _Unrelated(BaseException):
     """
-    What ``on_evaluation`` raised, on its way out past all that takes exceptions for the training's own.
+    What ``on_evaluation`` or a file raised, on its way out past all that takes exceptions for the training's own.
 
     :param error: The exception
     """
@@ -164,15 +166,22 @@ def train_candidate(
         ):
             try:
                 model, curve = store.load(env, settings.get("device", "auto")) if store is not None else (None, [])
-                tell = None if on_evaluation is None else _set_apart(on_evaluation)
-                if _repeat(curve, tell):
+
+                def tell(evaluation: Evaluation, anew: bool = True) -> bool | None:
+                    try:
+                        if store is not None and anew:
+                            write_curve(store.curve_path, curve_callback.curve)
+                        return on_evaluation is None or on_evaluation(evaluation)
+                    except Exception as error:
+                        raise _Unrelated(error) from error
+
+                if _repeat(curve, functools.partial(tell, anew=False)):
                     model = model or SACAux(policy, env, **settings)
                     curve_callback = LearningCurveCallback(
                         eval_env,
                         checkpoints,
                         evaluation_episodes,
                         seed=(EVALUATION_SEED + EVALUATION_SEEDS * seed) % HALF,
-                        path=None if store is None else store.curve_path,
                         on_evaluation=tell,
                         curve=curve,
                     )
@@ -264,18 +273,6 @@ def _closed(env: VecEnv) -> Iterator[VecEnv]:
             env.close()
 
 
-def _set_apart(on_evaluation: Callable[[Evaluation], bool | None]) -> Callable[[Evaluation], bool | None]:
-    """The same function, whose exceptions nobody takes for the training's."""
-
-    def tell(evaluation: Evaluation) -> bool | None:
-        try:
-            return on_evaluation(evaluation)
-        except Exception as error:
-            raise _Unrelated(error) from error
-
-    return tell
-
-
 def _repeat(curve: Sequence[Evaluation], on_evaluation: Callable[[Evaluation], bool | None] | None) -> bool:
     """Tell of the evaluations of a run that goes on; False if training is to end."""
     return on_evaluation is None or all(on_evaluation(evaluation) is not False for evaluation in curve)
@@ -345,6 +342,8 @@ class _RunFolder:
                     model._last_obs = None
                     # Not the initial states of the beginning again.
                     env.seed(HALF + (self.seed + model.num_timesteps) % HALF)
+                for path in self._checkpoints.glob(f"{UNFINISHED}*"):
+                    _remove(path)
                 return model, curve
         self.remove_checkpoint()
         if self.model_path.exists():
@@ -359,9 +358,9 @@ class _RunFolder:
         key = user_key()
         if key is None:
             return
-        unfinished = self._checkpoints / "unfinished"
-        _remove(unfinished)
-        unfinished.mkdir(parents=True)
+        self._checkpoints.mkdir(parents=True, exist_ok=True)
+        # A name of its own: a worker that was taken for dead may still be at work here.
+        unfinished = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=self._checkpoints))
         env = model.get_env()
         assert env is not None
         try:
@@ -375,13 +374,14 @@ class _RunFolder:
             write_curve(unfinished / "curve.csv", curve)
             self._describe(unfinished)
             seal(unfinished, key, {"cut_off": cut_off})
-            checkpoint = unfinished.rename(self._checkpoints / str(curve[-1].environment_steps))
-        except BaseException:
+            checkpoint = self._checkpoints / str(curve[-1].environment_steps)
+            if not checkpoint.exists():  # else it is that of the same training at the same step
+                unfinished.rename(checkpoint)
+        finally:
             _remove(unfinished)  # half of it may be what fills the disk
-            raise
         sync_folder(self._checkpoints)
         for path in self._checkpoints.glob("*"):
-            if path != checkpoint:
+            if path != checkpoint and path.name.isdecimal():
                 _remove(path)
 
     def save_model(self, model: SACAux) -> None:
@@ -452,7 +452,10 @@ class _CheckpointCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         if len(self.curve) > self._n_saved:
             assert isinstance(self.model, SACAux)
-            self.store.save(self.model, self.curve)
+            try:
+                self.store.save(self.model, self.curve)
+            except OSError as error:
+                raise _Unrelated(error) from error
             if self.model.use_sde:
                 # A training that goes on from here draws the noise of this rollout first; so does this one.
                 self.model.actor.reset_noise(self.training_env.num_envs)

@@ -59,8 +59,8 @@ def is_dead(worker: str) -> bool:
 
     :param worker: What :func:`identity` gave
     """
-    machine, pid, started = worker.rsplit(" ", 2)
-    if machine != _machine():
+    machine, pid, started = ["", "", *worker.rsplit(" ", 2)][-3:]
+    if machine != _machine() or not pid.isdecimal():
         return False
     try:
         return _started(int(pid)) != started or psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE

@@ -170,14 +170,19 @@ def test_time_is_up_once_however_calls_are_nested(postgres: Postgres, url: str) 
     study = optuna.create_study(storage=storage)
     trial = study.ask()
     study.tell(trial, 1.0)
-    storage.patience = 1.0
     postgres.stop()
     try:
         for call in (lambda: study.best_trial, lambda: storage.get_best_trial(study._study_id)):
+            storage.patience = 1.0
             started = time.monotonic()
             with pytest.raises(ServerLost, match="tried for 1 s"):
                 call()
             assert time.monotonic() - started < 4
+            # What is put away after that does not wait as long again.
+            started = time.monotonic()
+            with pytest.raises(ServerLost):
+                storage.set_trial_user_attr(trial._trial_id, "reason", "lost")
+            assert time.monotonic() - started < 0.9
         # The thread that gives signs of life must live, and the end of a trial waits for it.
         storage.patience, storage.heartbeat_interval = 600, 1
         started = time.monotonic()
@@ -373,6 +378,41 @@ def test_the_trial_of_a_stopped_worker_fails_and_that_of_a_live_one_does_not(
         workers.beat(study, trials[number]._trial_id)
         workers.beat(storage, silent._trial_id)
         assert study.trials[number].state == TrialState.FAIL
+
+
+def test_workers_of_the_proxy_and_of_its_database_see_each_other(url: str) -> None:
+    port = free_port()
+    with proxy(url, port):
+        ways = [open_storage(where, patience=60, heartbeat_interval=1) for where in (url, f"grpc://127.0.0.1:{port}")]
+        optuna.create_study(study_name="both", storage=ways[0])
+        studies = [optuna.load_study(study_name="both", storage=way) for way in ways]
+        for study in studies:
+            workers.beat(study, study.ask()._trial_id)
+        deadline = time.monotonic() + 30
+        # Each watches; only the first worker still gives signs of life.
+        while studies[0].trials[1].state == TrialState.RUNNING:
+            assert time.monotonic() < deadline
+            workers.beat(studies[0], studies[0].trials[0]._trial_id)
+            for study in studies:
+                workers.fail_dead(study, [])
+            time.sleep(0.1)
+        assert studies[1].trials[0].state == TrialState.RUNNING
+        while studies[1].trials[0].state == TrialState.RUNNING:
+            assert time.monotonic() < deadline
+            workers.fail_dead(studies[1], [])
+            time.sleep(0.1)
+
+
+def test_a_worker_is_judged_by_its_own_interval(tmp_path: Path) -> None:
+    slow, fast = (open_storage(tmp_path, heartbeat_interval=seconds) for seconds in (60, 1))
+    study = optuna.create_study(study_name="study", storage=slow)
+    workers.beat(study, study.ask()._trial_id)
+    watching = optuna.load_study(study_name="study", storage=fast)
+    deadline = time.monotonic() + 3
+    while time.monotonic() < deadline:
+        workers.fail_dead(watching, [])
+        time.sleep(0.1)
+    assert watching.trials[0].state == TrialState.RUNNING
 
 
 @pytest.mark.parametrize("kind", ["journal", "sqlite"])

@@ -112,6 +112,8 @@ def test_a_folder_may_be_called_like_a_database(tmp_path: Path, monkeypatch: pyt
         ("postgresql:///db?host=h&password=secret&user=me", "postgresql:///db?host=h&password=***&user=me"),
         ("sqlite:///study.db", "sqlite:///study.db"),
         ("redis://:secret@host", "redis://:***@host"),
+        ("postgresql:/me:secret@host/db", "postgresql:/me:***@host/db"),
+        ("postgresql:me:secret@host/db", "postgresql:me:***@host/db"),
         ("postgresql+psycopg://me:se@cr@et@host/db", "postgresql+psycopg://me:***@host/db"),
         ("postgresql://me:s%40cret%3A@host:5432/db?sslmode=require", "postgresql://me:***@host:5432/db?sslmode=require"),
         ("connect with host=h password=secret user=me", "connect with host=h password=*** user=me"),

@@ -119,8 +119,8 @@ def test_signs_of_life_are_given_where_the_storage_keeps_them(tmp_path: Path) ->
     signs = []
     for of in (study, study._storage):
         workers.beat(of, trial._trial_id)
-        signs.append(study.trials[0].system_attrs[HEARTBEAT_KEY])
+        signs.append(tuple(study.trials[0].system_attrs[HEARTBEAT_KEY]))
     assert len(set(signs)) == 2
     study.tell(trial, 1.0)
     workers.beat(study, trial._trial_id)
-    assert study.trials[0].system_attrs[HEARTBEAT_KEY] == signs[-1]
+    assert tuple(study.trials[0].system_attrs[HEARTBEAT_KEY]) == signs[-1]
