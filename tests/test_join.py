@@ -144,3 +144,23 @@ def test_a_search_on_ray(config: Path, tmp_path: Path) -> None:
     output = aarl("search", config, "--launcher", "ray", "--workers", 2, "--cpus-per-trial", 0.5, folder=tmp_path)
     assert "stage 2: 4/4 done" in output
     assert complete(str(tmp_path / "runs/tiny")) == [(stage, place) for stage in (1, 2) for place in range(4)]
+
+
+def test_a_worker_may_come_before_the_search(config: Path, tmp_path: Path) -> None:
+    where = f"sqlite:///{tmp_path / 'study.db'}"
+    worker = start("worker", "--storage", where, "--study", "tiny", "--threads", 1, "--wait", 100, folder=tmp_path)
+    for line in worker.stdout or ():
+        if "Waiting for the search" in line:
+            break
+    aarl("search", config, "--storage", where, "--workers", 0, folder=tmp_path)
+    output, _ = worker.communicate(timeout=100)
+    assert worker.returncode == 0 and "stage 2: 4/4 done" in output, output
+
+
+def test_a_study_never_gets_fewer_stages(config: Path, tmp_path: Path) -> None:
+    study = optuna.create_study(study_name="tiny")
+    evolve.keep_config(study, load_config(config))
+    with pytest.raises(ValueError, match="begun with 2 stages"):
+        evolve.keep_config(study, replace(load_config(config), stages=1))
+    evolve.keep_config(study, replace(load_config(config), stages=3))
+    assert evolve.stored_config(study, tmp_path).stages == 3

@@ -3,10 +3,13 @@
 import errno
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 import torch as th
 from optuna.exceptions import StorageInternalError
@@ -147,3 +150,35 @@ def test_what_a_user_can_mend_is_one_line(target: Callable[[Path], None], expect
     with pytest.raises(WorkerError, match=expected), WorkerPool(target, (tmp_path,), n_workers=1, threads=1) as pool:
         while pool.check(progressed=False):
             time.sleep(0.01)
+
+
+PROGRAM = """
+import sys, time
+from pathlib import Path
+from search.pool import WorkerPool
+from test_pool import write_gpu
+
+if __name__ == "__main__":
+    with WorkerPool(write_gpu, (Path(sys.argv[1]),), n_workers=1, threads=1) as pool:
+        print(pool.processes[0].pid, flush=True)
+        time.sleep(100)
+"""
+
+
+def test_workers_of_a_program_that_was_killed_at_once_end_too(tmp_path: Path) -> None:
+    """They import for seconds before they can look after their parent."""
+    paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parent.parent)])
+    (tmp_path / "program.py").write_text(PROGRAM)
+    with subprocess.Popen(
+        [sys.executable, str(tmp_path / "program.py"), str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": paths, "CUDA_VISIBLE_DEVICES": "0"},
+    ) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        process.kill()
+    deadline = time.monotonic() + 60
+    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)

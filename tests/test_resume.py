@@ -537,3 +537,43 @@ def test_a_full_disk_loses_nothing(
     assert steps == [last]
     assert [point[:4] for point in curve] == [point[:4] for point in undisturbed]
     assert SACAux.load(run / "model.zip").num_timesteps == 90
+
+
+def test_two_trainings_in_one_folder_do_no_harm_to_each_other(tmp_path: Path) -> None:
+    """A worker that was taken for dead goes on, while another one has got its candidate."""
+    environment, settings = CASES["pendulum"]
+    arguments = (environment, LOSS, HYPER | settings, 0, [30, 60, 90], 1)
+    undisturbed = train_candidate(*arguments, tmp_path / "undisturbed")
+    folder = tmp_path / "shared"
+
+    def other(evaluation: Evaluation) -> None:
+        if evaluation.environment_steps == 60:
+            # It finds the checkpoint of the first evaluation, overtakes, and ends.
+            assert train_candidate(*arguments, folder).aulc == undisturbed.aulc
+
+    # Its own figures differ here only because both draw from the generators of one process.
+    run = train_candidate(*arguments, folder, on_evaluation=other)
+    assert run.curve[:2] == read_curve(folder / "curve.csv")[:2] and len(run.curve) == 3
+    assert not (folder / "checkpoint").exists()
+
+
+@pytest.mark.parametrize("code", [errno.ESTALE, errno.ENOTCONN, errno.EACCES], ids=errno.errorcode.get)
+def test_a_folder_that_goes_away_is_not_the_candidates_fault(
+    code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment, settings = CASES["pendulum"]
+    arguments = (environment, LOSS, HYPER | settings, 0, [30, 60, 90], 1, tmp_path)
+    save, saved = training._RunFolder.save, []
+
+    def fails_once(*of: Any) -> None:
+        saved.append(of)
+        if len(saved) == 2:
+            raise OSError(code, os.strerror(code))
+        save(*of)
+
+    monkeypatch.setattr(training._RunFolder, "save", fails_once)
+    with pytest.raises(OSError) as raised:
+        train_candidate(*arguments)
+    assert raised.value.errno == code
+    assert [path.name for path in (tmp_path / "checkpoint").iterdir()] == ["30"]
+    assert [point.environment_steps for point in train_candidate(*arguments).curve] == [30, 60, 90]
