@@ -21,11 +21,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
+import hypothesis
 import torch as th
 import typer
 from fuzz_texts import configurations, notations
+from hypothesis import HealthCheck, strategies
 from rich.console import Console
-from rich.progress import track
+from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -243,7 +245,6 @@ def main(
     target: Annotated[str, typer.Argument(help=f"one of: {', '.join(TARGETS)}")],
     inputs: Annotated[int, typer.Option(help="how many")] = 100_000,
     seed: Annotated[int, typer.Option(help="other inputs with another one")] = 0,
-    first: Annotated[int, typer.Option(help="number of the first one, to repeat a failure")] = 0,
     out: Annotated[Path | None, typer.Option(help="JSON file for the counts")] = None,
 ) -> None:
     """Feed a target with hostile inputs; the first undocumented exception, or execution, ends it."""
@@ -253,21 +254,29 @@ def main(
     console = Console()
     outcomes: Counter[tuple[str, str]] = Counter()
     slowest = 0.0
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as name:
+    with (
+        tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as name,
+        Progress(*Progress.get_default_columns(), MofNCompleteColumn(), console=console) as bar,
+    ):
         folder, marker = Path(name) / "target", Path(name) / "executed"
         folder.mkdir()
         attempt = TARGETS[target](folder, marker)
-        started = time.monotonic()
-        for number in track(range(first, first + inputs), target, console=console):
+        task = bar.add_task(target, total=inputs)
+
+        # Inputs are too large to be drawn choice by choice: hypothesis draws the seeds, and names that of a failure.
+        @hypothesis.seed(seed)
+        @hypothesis.settings(max_examples=inputs, database=None, deadline=None, suppress_health_check=list(HealthCheck))
+        @hypothesis.given(strategies.randoms(use_true_random=True))
+        def fuzz(rng: random.Random) -> None:
+            nonlocal slowest
             before = time.monotonic()
-            try:
-                outcomes[attempt(random.Random(f"{target} {seed} {number}"))] += 1
-            except Exception:
-                console.print(f"input {number} has failed: --seed {seed} --first {number} --inputs 1 repeats it")
-                raise
+            outcomes[attempt(rng)] += 1
             slowest = max(slowest, time.monotonic() - before)
-            if marker.exists():
-                raise AssertionError(f"input {number} of seed {seed} was executed")
+            assert not marker.exists(), "it was executed"
+            bar.advance(task)
+
+        started = time.monotonic()
+        fuzz()
         seconds = time.monotonic() - started
     table = Table("input", "outcome", "count", title=f"{inputs:,} inputs, {seconds:.0f} s, the slowest {slowest:.3f} s")
     for (kind, outcome), count in sorted(outcomes.items()):
@@ -277,7 +286,8 @@ def main(
         counts: dict[str, dict[str, int]] = {}
         for (kind, outcome), count in sorted(outcomes.items()):
             counts.setdefault(kind, {})[outcome] = count
-        save_result(out, target=target, inputs=inputs, seed=seed, seconds=round(seconds, 1), outcomes=counts, executed=0)
+        measured = {"inputs": outcomes.total(), "seconds": round(seconds, 1), "slowest_seconds": round(slowest, 3)}
+        save_result(out, target=target, seed=seed, **measured, outcomes=counts, executed=0)
 
 
 if __name__ == "__main__":
