@@ -201,10 +201,10 @@ def test_what_an_interrupted_grid_left_is_passed_over_until_it_is_asked_for_agai
 def test_a_search_that_trains_otherwise_is_another_one(tmp_path: Path, changed: dict, name: str) -> None:
     (tmp_path / "hyperparameters.yml").write_text("default: {batch_size: 8, policy_kwargs: {net_arch: [8]}}\n")
     values = {**vars(CONFIG), "hyperparameters": tmp_path / "hyperparameters.yml"}
-    for accepted in ({}, {"stages": 9}, {"overrides": {"device": "cpu"}}):
-        next(evolve.search(SearchConfig(**{**values, **accepted}), tmp_path, str(tmp_path)))
+    for accepted in ({}, {"stages": 9}, {"stages": 9, "overrides": {"device": "cpu"}}):
+        next(evolve.search(SearchConfig(**{**values, **accepted}), tmp_path, str(tmp_path), None))
     with pytest.raises(ValueError, match=f"'some' was begun with {name}="):
-        next(evolve.search(SearchConfig(**{**values, **changed}), tmp_path, str(tmp_path)))
+        next(evolve.search(SearchConfig(**{**values, **changed}), tmp_path, str(tmp_path), None))
     assert load_study(open_storage(tmp_path), "some").user_attrs[grid.TRAINING_KEY]["candidates"]["batch_size"] == 8
 
 
