@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import timedelta
@@ -41,23 +42,38 @@ def program() -> None:
 @contextlib.contextmanager
 def clear_errors() -> Iterator[None]:
     """What a user can mend is one line and exit code 2, not a traceback; Ctrl-C is exit code 130."""
-    from optuna.exceptions import StorageInternalError
-
-    from search.pool import WorkerError, message
-    from search.training import TrainingError
-
     # Clusters announce the end of a job with SIGTERM: what is there is put away as after Ctrl-C.
     with contextlib.suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
-    except (ValueError, OSError, TrainingError, WorkerError, StorageInternalError) as error:
-        text = message(error) if isinstance(error, StorageInternalError) else " ".join(str(error).split())
+    except Exception as error:
+        text = _one_line(error)
+        if text is None:
+            raise
         errors.print(f"Error: {text}", style="red", markup=False, highlight=False)
         raise typer.Exit(2) from None
     except KeyboardInterrupt:
         errors.print("Interrupted. The same command goes on from the last checkpoint.", markup=False)
         raise typer.Exit(130) from None
+
+
+def _one_line(error: Exception) -> str | None:
+    """What a user is told of an error that he can mend; None for others."""
+    from search.training import TrainingError
+
+    if isinstance(error, (ValueError, OSError, TrainingError)):
+        return " ".join(str(error).split())
+    if "search.pool" in sys.modules:  # else it is not of Optuna, which a training alone does without
+        from optuna.exceptions import StorageInternalError
+
+        from search.pool import WorkerError, message
+
+        if isinstance(error, WorkerError):
+            return " ".join(str(error).split())
+        if isinstance(error, StorageInternalError):
+            return message(error)
+    return None
 
 
 @app.command()
