@@ -2,7 +2,7 @@
 Does a search survive? Workers are killed at random, the database is restarted, and the search must end as if nothing had been.
 
 The search trains real candidates (SACAux on Pendulum-v1, tiny networks), so that checkpoints, notes and curves are real too.
-It runs twice for each storage: undisturbed, with one worker; and with ``aarl search`` and ``aarl worker`` side by side, where
+It runs twice for each storage: undisturbed, with two workers; and with ``aarl search`` and ``aarl worker`` side by side, where
 the second runs in a process namespace of its own (if this process may make one), so that its dead are recognised by their
 heartbeats as those of another machine are. A killer sends SIGKILL to a random worker every few seconds, now and then to one
 of the two programs, which are started again; PostgreSQL is restarted once, half way through.
@@ -228,7 +228,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as parent:
         alone = make_folder(Path(parent), "alone", args.stages)
         started = time.monotonic()
-        command = [*AARL, "search", "soak.yml", "--workers", "1", "--threads", "1"]
+        command = [*AARL, "search", "soak.yml", "--workers", "2", "--threads", "1"]
         root = str(Path(__file__).parent.parent)
         subprocess.run(command, cwd=alone, check=True, stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": root})
         expected = filled(study_of(str(alone / "runs/soak")).get_trials(deepcopy=False))
