@@ -525,7 +525,7 @@ def test_a_proxy_stops_on_ctrl_c_also_while_its_database_is_away(postgres: Postg
             waiting.start()
             time.sleep(0.5)
             process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=10) == 0
+            assert process.wait(timeout=60) == 0
             waiting.join(10)
         finally:
             postgres.start()
