@@ -182,7 +182,9 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
 
     while True:
         try:
-            workers.fail_dead(study, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
+            # One that died before it gave its name keeps a place from the others, who leave it one.
+            running = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+            workers.fail_dead(study, running, all_have_names=True)
             # Without this look a worker too many would leave a trial behind that never got a place.
             if sampler.has_place(study):
                 # Models lie in reference cycles: the next candidate needs their memory.

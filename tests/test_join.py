@@ -9,8 +9,10 @@ import pytest
 from optuna.trial import TrialState
 from program import aarl, start
 
-from search import evolve
+from search import evolve, workers
 from search.config import SearchConfig, load_config
+from search.sampler import AuxLossSampler
+from search.space import suggest_aux_loss
 
 CONFIGS = sorted(Path("zoo_configs/search").glob("*.yml"))
 TINY = """\
@@ -155,6 +157,23 @@ def test_a_worker_may_come_before_the_search(config: Path, tmp_path: Path) -> No
     aarl("search", config, "--storage", where, "--workers", 0, folder=tmp_path)
     output, _ = worker.communicate(timeout=100)
     assert worker.returncode == 0 and "stage 2: 4/4 done" in output, output
+
+
+def test_a_worker_that_died_before_it_had_a_name_keeps_no_place(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config.write_text(TINY.replace("stages: 2", "stages: 1"))
+    study = optuna.create_study(study_name="tiny", direction="maximize", storage=evolve.open_storage(tmp_path / "runs/tiny"))
+    evolve.keep_config(study, load_config(config))
+    monkeypatch.setattr(workers, "UNNAMED_SECONDS", 5.0)
+    sampler = AuxLossSampler(**load_config(config).sampler_settings())
+    begun = optuna.load_study(study_name="tiny", storage=study._storage, sampler=sampler)
+    begun.optimize(lambda trial: float(sum(suggest_aux_loss(trial, 2).target)), n_trials=3)
+    study._storage.create_new_trial(study._study_id)  # by a worker that is killed at this moment
+    evolve.run_worker("tiny", tmp_path / "runs/tiny", str(tmp_path / "runs/tiny"), 60)
+    assert complete(str(tmp_path / "runs/tiny")) == [(1, place) for place in range(4)]
+    (orphan,) = study.get_trials(states=(TrialState.FAIL,))
+    assert orphan.user_attrs["reason"] == "its worker died"
 
 
 def test_a_study_never_gets_fewer_stages(config: Path, tmp_path: Path) -> None:
