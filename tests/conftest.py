@@ -9,6 +9,8 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 # Checkpoints are signed with this key, not with the user's.
 os.environ.setdefault("AARL_KEY_FILE", os.path.join(tempfile.gettempdir(), f"sb3-aarl-tests-{os.getuid()}", "key"))
+# Ray forks in processes in which tests before used gRPC.
+os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")
 if sys.platform.startswith("linux"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 

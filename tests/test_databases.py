@@ -47,7 +47,13 @@ def url(postgres: Postgres) -> str:
 @contextmanager
 def python(code: str, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
     """A program in a process of its own, killed at the end."""
-    process = subprocess.Popen([sys.executable, "-c", code, *arguments], text=True, stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        text=True,
+        stdout=subprocess.PIPE,
+        # Whoever runs the tests in the background may ignore Ctrl-C, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     try:
         yield process
     finally:
