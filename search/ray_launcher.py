@@ -268,13 +268,11 @@ def _joined(address: str | None) -> Iterator[None]:
     try:
         if address is None:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-            local = {"num_cpus": cores, "include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
+            local: dict[str, Any] = {"num_cpus": cores, "include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
             try:
                 ray.init(address="local", **local, **quiet)
-            except (
-                RuntimeError,
-                OSError,
-            ) as error:  # on a busy machine its server may not be up in the time that Ray gives it
+            except (ValueError, OSError, RuntimeError, RayError) as error:
+                # On a busy machine its server may not be up in the time that Ray gives it.
                 if "Timed out" not in str(error):
                     raise
                 ray.shutdown()
