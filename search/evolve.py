@@ -200,8 +200,10 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
                 continue
             if problem := disk_problem(error, folder):
                 raise DiskError(problem) from None
-            # Optuna stumbles over what follows from it.
-            raise next((cause for cause in causes(error) if isinstance(cause, ServerLost)), error) from None
+            for cause in causes(error):
+                if isinstance(cause, ServerLost):  # Optuna stumbles over what follows from it
+                    raise cause from None
+            raise
 
 
 def search(

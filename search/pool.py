@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import torch as th
 from optuna.exceptions import StorageInternalError
 
-from search.storage import without_password
+from search.storage import root_cause, without_password
 
 # Deaths of workers without a trial finished in between, after which the pool gives up.
 MAX_DEATHS = 5
@@ -69,12 +69,10 @@ def message(error: BaseException) -> str:
 
     :param error: The error
     """
-    if isinstance(error, (ValueError, OSError, StorageInternalError)):
-        # What the database said stands in the cause.
-        causes: list[BaseException] = [error]
-        while causes[-1].__cause__ is not None and isinstance(error, StorageInternalError):
-            causes.append(causes[-1].__cause__)
-        return without_password(" ".join(str(causes[-1]).split()))
+    if isinstance(error, StorageInternalError):  # what the database said stands in the cause
+        return root_cause(error)
+    if isinstance(error, (ValueError, OSError)):
+        return without_password(" ".join(str(error).split()))
     return without_password("".join(traceback.format_exception(error)))
 
 

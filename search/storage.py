@@ -11,6 +11,7 @@ import threading
 import time
 import uuid
 import warnings
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
@@ -162,10 +163,10 @@ def outlast(call: Callable[[], T], is_lost: Callable[[Exception], bool], patienc
                 if began is None:
                     began = now
                     if seconds and _away.setdefault(server, token) is token:
-                        logger.warning("Cannot reach %s, trying again for %.0f s: %s", server, seconds, _reason(error))
+                        logger.warning("Cannot reach %s, trying again for %.0f s: %s", server, seconds, root_cause(error))
                 if now - began >= seconds:
                     tried_for = f", tried for {now - began:.0f} s" if now > began else ""
-                    raise ServerLost(f"cannot reach {server}{tried_for}: {_reason(error)}") from None
+                    raise ServerLost(f"cannot reach {server}{tried_for}: {root_cause(error)}") from None
                 _attempts.lost.append((tried, datetime.now()))
                 time.sleep(min(pause, began + seconds - now))
                 pause = min(2 * pause, PAUSES[1])
@@ -253,7 +254,7 @@ class WithHeartbeat(BaseStorage, BaseHeartbeat):
         except UpdateFinishedTrialError:
             pass
         except Exception as error:  # a full disk, a server that is away: the thread has to live until it is over
-            logger.warning("No sign of life could be given: %s", _reason(error))
+            logger.warning("No sign of life could be given: %s", root_cause(error))
 
     def _beat(self, trial_id: int) -> None:
         self.set_trial_system_attr(trial_id, HEARTBEAT_KEY, [time.time_ns(), self.heartbeat_interval])
@@ -299,9 +300,9 @@ class Outlasting(WithHeartbeat):
             if hasattr(cls, name):
                 setattr(cls, name, _outlasting(getattr(cls, name)))
 
+    @abstractmethod
     def is_lost(self, error: Exception) -> bool:
         """Whether an exception says that the server is away, and not that it refuses what it is asked for."""
-        raise NotImplementedError
 
     def set_trial_state_values(self, trial_id: int, state: TrialState, values: Sequence[float] | None = None) -> bool:
         """As in Optuna."""
@@ -497,7 +498,7 @@ def open_storage(
     except ServerLost as error:
         raise ValueError(str(error)) from None
     except Exception as error:  # whatever a driver raises
-        raise ValueError(f"cannot open the storage {shown}: {_reason(error)}") from None
+        raise ValueError(f"cannot open the storage {shown}: {root_cause(error)}") from None
 
 
 def _open_journal(where: str, create: bool, heartbeat_interval: int) -> Journal:
@@ -662,8 +663,12 @@ def without_password(text: str) -> str:
     return re.sub(r"(?i)((?:password|passwd|pwd)\s*=\s*)('(?:[^'\\]|\\.)*'|[^&\s]*)", r"\1***", text)
 
 
-def _reason(error: BaseException) -> str:
-    """What an exception stems from, in one line without passwords."""
+def root_cause(error: BaseException) -> str:
+    """
+    What an exception stems from, in one line without passwords.
+
+    :param error: The exception
+    """
     while (cause := error.__cause__ or (error.__context__ if isinstance(error, PendingRollbackError) else None)) is not None:
         error = cause
     details = getattr(error, "details", None)  # of gRPC, whose text is a page
