@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import optuna
 import pandas as pd
+import torch as th
 
 from sb3_aarl import catalog
 from sb3_aarl.callbacks import read_curve
@@ -109,7 +110,8 @@ class Benchmark:
         path = run_folder(folder, cell)
         about = self.about(cell)
         # A run that was killed and goes on has several.
-        about["sessions"] = [*_read_about(path).get("sessions", ()), provenance()]
+        session = {**provenance(), "threads": th.get_num_threads()}
+        about["sessions"] = [*_read_about(path).get("sessions", ()), session]
         _write_about(path, about)
         with end_noted(trial, path):
             run = train_candidate(

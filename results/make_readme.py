@@ -1,0 +1,156 @@
+"""
+Write README.md from the runs that lie beside it: every number in it comes from a curve.csv and its provenance.json.
+
+A folder here is what ``aarl benchmark`` leaves, without its storage and the checkpoints of unfinished runs. What is said of it
+stands in its about.md, the first line being its title; numbers do not belong there.
+"""
+
+import argparse
+import os
+import shlex
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from sb3_aarl.callbacks import read_curve
+from search.benchmark import read_abouts, task_name
+
+RESULTS = Path(__file__).parent
+ABOUT = "about.md"
+# The paper's search from states (appendix A.4): candidates, environment steps of each, and the GPU hours it took.
+CANDIDATES, STEPS, PAPER_HOURS = 700, 500_000, 1_500
+
+INTRODUCTION = f"""# Results
+
+Written by `python results/{Path(__file__).name}`: no number here is typed by hand. Each run's learning curve is
+`FOLDER/VARIANT/TASK/seed-N/curve.csv` (returns of deterministic episodes at environment steps), all that is needed to
+make it again is in the `provenance.json` beside it. Benchmarks of speed and of the search are in
+[benchmarks](../benchmarks/README.md).
+"""
+
+
+def readme(results: Path) -> str:
+    """
+    The whole text.
+
+    :param results: Folder with benchmarks' folders in it
+    """
+    return "\n".join([INTRODUCTION, *(line for folder in folders(results) for line in section(folder, results))]) + "\n"
+
+
+def folders(results: Path) -> list[Path]:
+    """
+    Folders of benchmarks, in alphabetical order.
+
+    :param results: Folder they are in
+    """
+    return sorted(path.parent for path in results.rglob(ABOUT))
+
+
+def section(folder: Path, results: Path) -> Iterator[str]:
+    """
+    What there is to say of a benchmark: its tables, its runs and what they cost.
+
+    :param folder: Folder of the benchmark
+    :param results: Folder it is in
+    """
+    title, _, text = (folder / ABOUT).read_text(encoding="utf-8").partition("\n")
+    name = folder.relative_to(results.parent).as_posix()
+    yield f"## {title}\n"
+    yield text.strip() + "\n"
+    yield f"`aarl table {name}`:\n"
+    yield "```text"
+    yield printed_table(folder)
+    yield "```\n"
+    abouts = read_abouts(folder)[0]
+    finished = [(path, about) for path, about in abouts.items() if "seconds" in about]
+    yield "| run | return | AULC | minutes | threads | processor | commit | date |"
+    yield "|---|---|---|---|---|---|---|---|"
+    for path, about in finished:
+        curve, sessions = read_curve(path / "curve.csv"), about["sessions"]
+        cells = [
+            f"[{path.relative_to(folder).as_posix()}]({path.relative_to(results).as_posix()}/curve.csv)",
+            f"{curve[-1].mean:.1f} at {curve[-1].environment_steps:,}",
+            f"{statistics.mean(point.mean for point in curve):.1f}",
+            f"{about['seconds'] / 60:.0f}",
+            *(
+                ", ".join(dict.fromkeys(str(session[key]) for session in sessions))
+                for key in ("threads", "cpu" if sessions[-1]["gpu"] == "none" else "gpu", "commit")
+            ),
+            sessions[-1]["date"][:10],
+        ]
+        yield f"| {' | '.join(cells)} |"
+    yield "\nMade by, and made again by (`--out` another folder):\n"
+    yield "```bash"
+    yield from dict.fromkeys(command(about) for _, about in finished)
+    yield "```\n"
+    yield from cost([about for _, about in finished])
+
+
+def printed_table(folder: Path) -> str:
+    """
+    What ``aarl table`` prints.
+
+    :param folder: Folder of a benchmark
+    """
+    program = [sys.executable, "-m", "search.cli", "table", str(folder)]
+    environment = {**os.environ, "COLUMNS": "120", "NO_COLOR": "1"}
+    printed = subprocess.run(
+        program, env=environment, cwd=RESULTS.parent, text=True, stdout=subprocess.PIPE, check=True
+    ).stdout
+    return "\n".join(line.rstrip() for line in printed.strip().splitlines())
+
+
+def command(about: dict[str, Any]) -> str:
+    """
+    The command that trains a run again.
+
+    :param about: What stands beside its curve
+    """
+    steps = about["evaluations"]
+    between = sorted(set(steps) - set(about["checkpoints"]))
+    words = ["aarl", "benchmark", about["file"], "--envs", task_name(about["environment"]), "--seeds", str(about["seed"])]
+    words += ["--checkpoints", ",".join(map(str, about["checkpoints"]))]
+    words += ["--every", str(between[0])] if between else []
+    words += ["--episodes", str(about["evaluation_episodes"]), "--threads", str(about["sessions"][-1]["threads"])]
+    return shlex.join(words)
+
+
+def cost(abouts: list[dict[str, Any]]) -> Iterator[str]:
+    """
+    What runs cost, and what the paper's whole search from states would cost at that rate.
+
+    :param abouts: What stands beside the curves of finished runs
+    """
+    yield "| variant | runs | seconds a run (median) | core hours a run | core hours of the paper's search |"
+    yield "|---|---|---|---|---|"
+    for variant in dict.fromkeys(about["variant"] for about in abouts):
+        runs = [about for about in abouts if about["variant"] == variant]
+        seconds = statistics.median(about["seconds"] for about in runs)
+        hours = [about["seconds"] * about["sessions"][-1]["threads"] / 3600 for about in runs]
+        per_step = statistics.median(h / about["evaluations"][-1] for h, about in zip(hours, runs, strict=True))
+        whole = CANDIDATES * STEPS * per_step
+        yield f"| {variant} | {len(runs)} | {seconds:,.0f} | {statistics.median(hours):.2f} | {whole:,.0f} |"
+    yield (
+        f"\nEvaluations included. The paper's search from states: {CANDIDATES} candidates of {STEPS:,} environment steps, "
+        f"{PAPER_HOURS:,} GPU hours.\n"
+    )
+
+
+def main() -> None:
+    """Write README.md, or say with ``--check`` that it is not what the runs say."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="write nothing, fail if README.md is not what would be written")
+    arguments = parser.parse_args()
+    path, text = RESULTS / "README.md", readme(RESULTS)
+    if not arguments.check:
+        path.write_text(text, encoding="utf-8")
+    elif path.read_text(encoding="utf-8") != text:
+        sys.exit(f"{path} is not what its runs say: python results/{Path(__file__).name}")
+
+
+if __name__ == "__main__":
+    main()

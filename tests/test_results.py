@@ -1,0 +1,80 @@
+"""results/README.md says what the runs beside it say, and each of them can be made again with the command that it names."""
+
+import json
+import re
+import runpy
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+import search.cli
+from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
+from search.benchmark import ABOUT, Benchmark, load_benchmark, read_abouts, run_folder
+
+RESULTS = Path(__file__).parent.parent / "results"
+make_readme: dict[str, Any] = runpy.run_path(str(RESULTS / "make_readme.py"))
+SESSION = {"commit": "c0ffee", "cpu": "a processor", "gpu": "none", "date": "2026-11-21T12:00:00", "threads": 2}
+
+
+def asked_for(folder: Path, command: str, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """What a printed command would train."""
+    trained: list[Benchmark] = []
+    monkeypatch.setattr(search.cli, "_train_grid", lambda grid, *_: (trained.append(grid), {}))
+    program, *words = shlex.split(command)
+    assert program == "aarl"
+    with monkeypatch.context() as patch:
+        patch.chdir(RESULTS.parent)
+        CliRunner().invoke(search.cli.app, [*words, "--out", str(folder / "again")])
+    (grid,) = trained
+    return [grid.about(cell) for cell in grid.cells]
+
+
+def commands(text: str) -> list[str]:
+    return [line for block in re.findall(r"```bash\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+
+
+def test_readme_of_planted_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [Path("zoo_configs") / f"{name}.yml" for name in ("aarl_state", "sac_dense_mlp")]
+    monkeypatch.chdir(RESULTS.parent)
+    grid = load_benchmark(files, ["cheetah-run"], [0, 2], [100_000], 50_000, 3)
+    folder = tmp_path / "results" / "planted"
+    runs = {}
+    for place, cell in enumerate(grid.cells):
+        path = run_folder(folder, cell)
+        path.mkdir(parents=True)
+        seconds = 3600.0 * (place + 1)
+        curve = [Evaluation(50_000, 10.0 * place, 1.0, 3, seconds / 2), Evaluation(100_000, 30.0 * place, 1.0, 3, seconds)]
+        write_curve(path / "curve.csv", curve)
+        runs[path] = {**grid.about(cell), "sessions": [SESSION], "seconds": seconds}
+        (path / ABOUT).write_text(json.dumps(runs[path]))
+    (folder / "about.md").write_text("Planted\nWhat is said.\n")
+
+    text = make_readme["readme"](tmp_path / "results")
+    assert "## Planted\n\nWhat is said.\n" in text
+    assert "100K steps scores" in text and "472 ± 30" in text  # the paper's
+    for place, path in enumerate(runs):
+        row = f"| [{path.relative_to(folder)}]({path.relative_to(folder.parent)}/curve.csv) | {30 * place:.1f} at 100,000 "
+        assert row + f"| {20 * place:.1f} | {60 * (place + 1)} | 2 | a processor | c0ffee | 2026-11-21 |" in text
+    for variant in grid.files:
+        hours = sum(about["seconds"] for about in runs.values() if about["variant"] == variant) / 2 / 3600
+        # Two threads each; 3,500 times as many steps in a search.
+        assert f"| {variant} | 2 | {3600 * hours:,.0f} | {2 * hours:.2f} | {3500 * 2 * hours:,.0f} |" in text
+    asked = [about for command in commands(text) for about in asked_for(tmp_path, command, monkeypatch)]
+    assert sorted(asked, key=str) == sorted((grid.about(cell) for cell in grid.cells), key=str)
+
+
+def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = make_readme["readme"](RESULTS)
+    assert (RESULTS / "README.md").read_text(encoding="utf-8") == text, "python results/make_readme.py"
+    again = [about for command in commands(text) for about in asked_for(tmp_path, command, monkeypatch)]
+    for folder in make_readme["folders"](RESULTS):
+        abouts, unreadable = read_abouts(folder)
+        assert not unreadable
+        for path, about in abouts.items():
+            # The hyper-parameters are those that the file still has, and no number is without its curve.
+            kept = {key: value for key, value in {**about, "sessions": []}.items() if key != "seconds"}
+            assert kept in again
+            assert [point.environment_steps for point in read_curve(path / "curve.csv")] == about["evaluations"]
