@@ -22,12 +22,13 @@ import psycopg
 import pytest
 from optuna.exceptions import DuplicatedStudyError, StorageInternalError, UpdateFinishedTrialError
 from optuna.storages import BaseStorage, RDBStorage
+from optuna.study import StudyDirection
 from optuna.trial import TrialState
 from postgres import PASSWORD, Postgres, free_port
 from sqlalchemy.exc import DBAPIError, OperationalError
 
 from search import workers
-from search.storage import Database, ServerLost, open_storage, serve_proxy
+from search.storage import Database, ServerLost, SharedReads, open_storage, serve_proxy
 
 pytestmark = pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed")
 names = (f"database{number}" for number in count())
@@ -535,3 +536,57 @@ def test_a_proxy_stops_on_ctrl_c_also_while_its_database_is_away(postgres: Postg
             waiting.join(10)
         finally:
             postgres.start()
+
+
+class CountedLock:
+    """A lock that knows who has asked for it."""
+
+    def __init__(self) -> None:
+        self.asked: list[int] = []
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        self.asked.append(threading.get_ident())
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
+def test_threads_of_a_proxy_that_wait_share_one_reading(tmp_path: Path) -> None:
+    where = f"sqlite:///{tmp_path / 'study.db'}"
+    database = open_storage(where)
+    assert isinstance(database, Database)
+    shared, elsewhere = SharedReads(database), open_storage(where)
+    study_id = shared.create_new_study([StudyDirection.MAXIMIZE], "shared")
+    begun, go_on, turn = threading.Event(), threading.Event(), CountedLock()
+    shared._reading = turn  # type: ignore[assignment]
+    n_readings, read = 0, database._get_trials
+
+    def slow(*args: Any, **kwargs: Any) -> Any:
+        nonlocal n_readings
+        n_readings += 1
+        trials = read(*args, **kwargs)
+        begun.set()
+        assert go_on.wait(30)
+        if n_readings == 2:
+            raise ValueError("the second reading fails")
+        return trials
+
+    database._get_trials = slow  # type: ignore[method-assign]
+    with ThreadPoolExecutor(8) as pool:
+        first = pool.submit(shared.get_all_trials, study_id)
+        assert begun.wait(30)
+        # What is written now, past the proxy, must be seen by all that ask from now on, though a reading is under way.
+        elsewhere.create_new_trial(study_id)
+        others = [pool.submit(shared.get_all_trials, study_id) for _ in range(6)]
+        while len(turn.asked) < 7:
+            time.sleep(0.01)
+        go_on.set()
+        assert first.result() == []
+        errors = [future.exception() for future in others]
+        seen = [future.result() for future in others if future.exception() is None]
+    # One of the six reads and fails, another one reads again for all that are left.
+    assert [type(error) for error in errors if error] == [ValueError] and n_readings == 3
+    assert [len(trials) for trials in seen] == [1] * 5
+    assert len(shared.get_all_trials(study_id)) == 1 and n_readings == 4
