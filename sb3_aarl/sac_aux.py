@@ -33,8 +33,8 @@ logger = logging.getLogger(__name__)
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
 
 
-# A training whose Q values are this many times larger than rewards and entropy allow has diverged. Healthy ones overshoot by
-# less than ten times while they are learnt; those that explode go through a factor of a thousand on their way to infinity.
+# A training whose Q values are this many times larger than rewards and entropy allow has diverged: healthy ones may overshoot
+# while they are learnt, those that explode go through a factor of a thousand on their way to infinity.
 EXPLODED = 1000.0
 # The largest log density of a squashed Gaussian for each dimension of an action: SB3 clips the log standard deviation at -20,
 # and takes the slope of tanh for 1e-6 at least.
