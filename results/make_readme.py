@@ -38,7 +38,8 @@ def readme(results: Path) -> str:
 
     :param results: Folder with benchmarks' folders in it
     """
-    return "\n".join([INTRODUCTION, *(line for folder in folders(results) for line in section(folder, results))]) + "\n"
+    sections = [line for folder in folders(results) for line in section(folder, results)]
+    return "\n".join([INTRODUCTION, *(sections or ["No run is finished yet."])]).strip() + "\n"
 
 
 def folders(results: Path) -> list[Path]:
