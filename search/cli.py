@@ -89,9 +89,9 @@ def train(
         int | None,
         typer.Option(help="Environment steps (agent steps x action repeat). Default: the file's n_timesteps."),
     ] = None,
-    evaluations: Annotated[int, typer.Option(help="Number of evaluations, equally spaced.")] = 5,
-    episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 10,
-    seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
+    evaluations: Annotated[int, typer.Option(help="Number of evaluations, equally spaced.", min=1)] = 5,
+    episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.", min=1)] = 10,
+    seed: Annotated[int, typer.Option(help="Seed of the training.", min=0)] = 0,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder for model and learning curve. Default: in runs/."),
@@ -257,7 +257,7 @@ def proxy(
     host: Annotated[
         str, typer.Option(help="Address to listen on; the default is reached from this machine only. There is no password.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to listen on.")] = 13000,
+    port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 13000,
 ) -> None:
     """Serve a database to many workers through Optuna's gRPC proxy; they take --storage grpc://host:port."""
     with clear_errors():
@@ -365,14 +365,21 @@ def baselines(
 ) -> None:
     """Train the baselines of a search, which the evolution is compared with."""
     with clear_errors():
+        from optuna import get_all_study_names
+
         from search import cross_validation, evolve
         from search.config import load_config
+        from search.dashboard import update_plots
+        from search.storage import load_study, open_storage
 
         settings = load_config(config)
         if not settings.baselines:
             raise ValueError(f"{config} names no baselines")
         runs, failures = _train_grid(evolve.baselines(settings), run_folder(config, folder), storage, workers, threads)
         _compare(runs, cross_validation.ranking, "Baselines, AULC")
+        opened = open_storage(storage or str(run_folder(config, folder)))
+        if settings.name in get_all_study_names(opened):
+            update_plots(load_study(opened, settings.name), evolve.baseline_scores(settings, opened))
         _stop_if_failed(failures)
 
 
@@ -536,16 +543,21 @@ def dashboard(
     host: Annotated[
         str, typer.Option(help="Address to listen on; the default is reached from this machine only.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to listen on.")] = 8080,
+    port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
 ) -> None:
     """Watch a search in optuna-dashboard."""
     with clear_errors():
-        from search.dashboard import serve
-        from search.evolve import ARTIFACTS
-        from search.storage import open_storage
+        from search.dashboard import serve, update_plots
+        from search.evolve import ARTIFACTS, CONFIG_KEY
+        from search.report import stored_baselines
+        from search.storage import load_study, open_storage
 
         folder = _search_folder(folder, storage)
         opened = open_storage(storage or str(folder), create=False)
+        for found in opened.get_all_studies():
+            if CONFIG_KEY in found.user_attrs:  # a search that was interrupted has an old plot
+                name = found.study_name
+                update_plots(load_study(opened, name), stored_baselines(opened, name))
         console.print(f"http://{host}:{port}/  (Ctrl-C to stop)", highlight=False)
         serve(opened, (folder or Path("runs")) / ARTIFACTS, host, port)
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import re
 import tempfile
 import textwrap
@@ -65,21 +66,24 @@ def annotate_trial(study: Study, trial: FrozenTrial | int, artifact_store: FileS
     """
     trials = study.get_trials(deepcopy=False)
     trial = trials[trial if isinstance(trial, int) else trial.number]
-    loss, curve = loss_of(trial), curve_of(trial)
+    # Until all seeds are done there is what was reported of the first.
+    reported = [(step, mean, math.nan) for step, mean in sorted(trial.intermediate_values.items())]
+    loss, curve = loss_of(trial), curve_of(trial) or reported
     note = [*_loss_lines(trial, loss), _origin(trial)]
     if "reason" in trial.user_attrs:
         note.append(f"**Reason:** {_escape(trial.user_attrs['reason'])}")
     if curve:
         # The last evaluation is always among the rows.
-        rows = [(step, f"{mean:.1f}", f"{std:.1f}") for step, mean, std in curve[:: -len(curve) // MAX_CURVE_ROWS]]
+        shown = curve[:: -len(curve) // MAX_CURVE_ROWS]
+        rows = [(step, f"{mean:.1f}", "-" if math.isnan(std) else f"{std:.1f}") for step, mean, std in shown]
         note += ["#### Learning curve", _table(("environment steps", "mean", "std"), rows[::-1])]
         if artifact_store is not None:
             note.append(f"![Learning curve]({_picture(study, trial, loss, curve, artifact_store)})")
     if ancestors := lineage(trial, trials):
-        shown = sorted(ancestors[:MAX_ANCESTORS], key=lambda ancestor: -ancestor.number)
-        note += ["#### Lineage", _table(("trial", "stage", "from", "score", "loss"), [_ancestor(other) for other in shown])]
-        if len(ancestors) > len(shown):
-            note.append(f"… and {len(ancestors) - len(shown)} more ancestors.")
+        nearest = sorted(ancestors[:MAX_ANCESTORS], key=lambda ancestor: -ancestor.number)
+        note += ["#### Lineage", _table(("trial", "stage", "from", "score", "loss"), [_ancestor(other) for other in nearest])]
+        if len(ancestors) > len(nearest):
+            note.append(f"… and {len(ancestors) - len(nearest)} more ancestors.")
     save_note(_noted(study, trial), "\n\n".join(note))
 
 
@@ -122,7 +126,8 @@ def _wrap(latex: str, width: int) -> list[str]:
 
 def _origin(trial: FrozenTrial) -> str:
     score, parents = score_of(trial), parents_of(trial)
-    text = f"**Score:** {score:.2f}" if score is not None else f"**State:** {trial.state.name.lower()}"
+    state = trial.state.name.lower() if trial.state.is_finished() else "begun"
+    text = f"**Score:** {score:.2f}" if score is not None else f"**State:** {state}"
     text += f". **Stage:** {stage_of(trial)}. **Operation:** {_escape(operation_of(trial))}"
     return text + (f" of trial {' and trial '.join(map(str, parents))}." if parents else ".")
 

@@ -165,9 +165,16 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
     config = stored_config(load_study(storage, name), folder)
     sampler = AuxLossSampler(**config.sampler_settings(), worker=workers.identity())
     study = optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=make_pruner(config))
-    objective = Objective(config, folder / "candidates")
     artifacts = _artifacts(folder)
     failures = 0
+    current: int | None = None
+
+    def begun(trial: optuna.Trial) -> None:
+        nonlocal current
+        current = trial.number
+        annotate_trial(study, current, artifacts)
+
+    objective = Objective(config, folder / "candidates", on_begin=begun)
 
     def finished(study: optuna.Study, trial: FrozenTrial) -> None:
         nonlocal failures
@@ -193,6 +200,11 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
                 time.sleep(POLL_SECONDS)
         except SearchComplete:
             return
+        except KeyboardInterrupt:
+            if current is not None:  # Optuna calls nobody back then
+                with uninterrupted():
+                    annotate_trial(study, current, artifacts)
+            raise
         except Exception as error:
             # A laptop that slept: others took this worker for dead and failed its trial, whose place they give out again.
             if isinstance(error, UpdateFinishedTrialError) or str(error).startswith("Cannot tell a FAIL trial"):
@@ -233,15 +245,8 @@ def search(
     progress = look(study, sampler)  # refuses a study that was begun with other settings of the sampler
     keep_config(study, config)
     annotate_study(study, settings(config), provenance())
-    lines = baseline_scores(config, storage)
     yield progress
-    ended, drawn = -1, 0.0
-    for progress in _fill(study, sampler, launch, folder, where, heartbeat):
-        if _ended(progress) != ended and time.monotonic() - drawn > PLOT_SECONDS:
-            update_plots(study, lines)
-            ended, drawn = _ended(progress), time.monotonic()
-        yield progress
-    update_plots(study, lines)
+    yield from _drawn(_fill(study, sampler, launch, folder, where, heartbeat), study, config)
 
 
 def join(
@@ -281,7 +286,18 @@ def join(
     check_study(study, config)
     sampler = AuxLossSampler(**config.sampler_settings())
     yield look(study, sampler)
-    yield from _fill(study, sampler, launch, folder, where, heartbeat)
+    yield from _drawn(_fill(study, sampler, launch, folder, where, heartbeat), study, config)
+
+
+def _drawn(progresses: Iterator[Progress], study: optuna.Study, config: SearchConfig) -> Iterator[Progress]:
+    """Draw the evolution now and then, and at the end."""
+    ended, drawn = -1, 0.0
+    for progress in progresses:
+        if _ended(progress) != ended and time.monotonic() - drawn > PLOT_SECONDS:
+            update_plots(study, baseline_scores(config, study._storage))
+            ended, drawn = _ended(progress), time.monotonic()
+        yield progress
+    update_plots(study, baseline_scores(config, study._storage))
 
 
 def _fill(

@@ -5,7 +5,7 @@ import errno
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,10 +63,14 @@ class Objective:
     :param config: The search
     :param folder: Where every candidate has a folder of its own, with its learning curves. Those of another study that
         are there are passed over
+    :param on_begin: Called with a trial as soon as it has its loss
     """
 
-    def __init__(self, config: SearchConfig, folder: str | Path):
+    def __init__(
+        self, config: SearchConfig, folder: str | Path, on_begin: Callable[[optuna.Trial], None] = lambda trial: None
+    ):
         self.config = config
+        self.on_begin = on_begin
         self.folder = Path(folder)
         self.commit = commit()
         self._checked: tuple[Any, int] | None = None
@@ -86,6 +90,7 @@ class Objective:
             self._checked = (study._storage, study._study_id)
         with end_noted(trial, self.folder):
             loss = suggest_aux_loss(trial, self.config.max_horizon, self.config.operators)
+            self.on_begin(trial)
             return self._train(trial, loss, self.config.environment, self.config.seeds, {}, None)
 
     def train(

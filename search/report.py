@@ -66,9 +66,11 @@ def stage_rows(study: Study) -> list[StageRow]:
     :param study: The study
     """
     stages: dict[int, list[FrozenTrial]] = {}
-    for trial in study.get_trials(deepcopy=False):
-        stages.setdefault(stage_of(trial), []).append(trial)
     settings = study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY)
+    for trial in study.get_trials(deepcopy=False):
+        # A worker that asks for more than there is left leaves a trial that never had a place. Other samplers have no stages.
+        if settings is None or "stage" in trial.user_attrs or trial.state == TrialState.WAITING:
+            stages.setdefault(stage_of(trial), []).append(trial)
     best = max if study.direction == StudyDirection.MAXIMIZE else min
     rows = []
     for stage, trials in sorted(stages.items()):

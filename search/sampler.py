@@ -3,6 +3,7 @@
 import bisect
 import contextlib
 import logging
+import math
 import threading
 import time
 import zlib
@@ -163,15 +164,15 @@ class AuxLossSampler(BaseGASampler):
     :param n_prior: Losses of the first stage from the priors, both in turn (paper: 25)
     :param parents: Share of a stage that the next one stems from (paper: 0.25)
     :param replacement: Share of flipped masks (paper: 0.5)
-    :param crossover: Share of crossovers (paper: 0.2). Where no two parents have one horizon, the partner is any of the
-        stage; where there is none either, the place gets a replacement
+    :param crossover: Share of crossovers (paper: 0.2), of two parents of one horizon. Where no two parents have one, the
+        second is any candidate of the stage; where there is none either, as in small stages, the place gets a replacement
     :param horizon_change: Share of changed horizons (paper: 0.1)
     :param random: Share of random losses (paper: 0.2)
     :param max_horizon: Longest horizon (paper: 10)
     :param operators: Operators to search too, as in ``suggest_aux_loss``; None for mean squared error (paper, 2.2)
     :param allow_duplicates: Whether a loss may be trained again, as in the paper; else a candidate whose canonical
-        form the search had already is drawn again
-    :param seed: Seed of the evolution. None for a random one, kept in the study; a study keeps its first seed
+        form the search had already is drawn again. Candidates in place of failed ones may still, rarely, repeat each other
+    :param seed: Seed of the evolution, not negative. None for a random one, kept in the study; a study keeps its first seed
     :param screening: Offspring that are drawn for each place, of which the one is kept that a Bayesian linear model of
         the tokens, fitted to the stages before, rates highest under one posterior draw; 1 for the paper's evolution
     :param retries: How often a candidate is given out again after its worker died, before it is taken for the cause
@@ -180,6 +181,10 @@ class AuxLossSampler(BaseGASampler):
         are given out again, and where the storage has heartbeats, a trial has one as soon as it is asked for
         (``study.optimize`` goes on with them). None where trials are told by another process than the one that asked
     :raises ValueError: naming the argument that does not fit
+    :raises TypeError: naming the argument that is no int
+
+    A candidate that fails makes room for another one, unless its trial has the user attribute ``interrupted``: then the same
+    one is given out again. ``search.objective.end_noted`` sets it at Ctrl-C.
     """
 
     def __init__(
@@ -201,6 +206,12 @@ class AuxLossSampler(BaseGASampler):
         n_stages: int | None = None,
         worker: str | None = None,
     ):
+        whole: dict[str, int | None] = {"population_size": population_size, "n_random": n_random, "n_prior": n_prior}
+        whole |= {"max_horizon": max_horizon, "screening": screening, "retries": retries, "n_stages": n_stages, "seed": seed}
+        for name, number in whole.items():
+            # Of Python, not of numpy: they are stored as JSON.
+            if number is not None and (isinstance(number, bool) or not isinstance(number, int)):
+                raise TypeError(f"{name} must be an int, not {number!r}")
         super().__init__(population_size)
         positive = {"population_size": population_size, "max_horizon": max_horizon, "screening": screening}
         positive |= {"n_random + n_prior": n_random + n_prior, "n_stages": 1 if n_stages is None else n_stages}
@@ -208,8 +219,9 @@ class AuxLossSampler(BaseGASampler):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, not {value}")
         shares = {"random": random, "replacement": replacement, "crossover": crossover, "horizon_change": horizon_change}
-        for name, share in {**shares, "n_random": n_random, "n_prior": n_prior, "retries": retries}.items():
-            if share < 0:
+        counts = {"n_random": n_random, "n_prior": n_prior, "retries": retries, "seed": seed or 0}
+        for name, share in {**shares, **counts}.items():
+            if not 0 <= share < math.inf:
                 raise ValueError(f"{name} must not be negative, not {share}")
         if abs(sum(shares.values()) - 1) > 1e-9:
             raise ValueError(f"the shares {', '.join(shares)} must sum to 1, not {sum(shares.values())}")
@@ -231,8 +243,8 @@ class AuxLossSampler(BaseGASampler):
         # Operations place by place: what needs no parents comes first, so that it can be given out early.
         prior = ["prior"] * n_prior
         self._first_operations = ["random"] * n_random + prior
-        counts = _apportion(shares, population_size)
-        self._operations = [name for name in shares for _ in range(counts[name])]
+        places = _apportion(shares, population_size)
+        self._operations = [name for name in shares for _ in range(places[name])]
         self._reset()
 
     def _reset(self) -> None:
@@ -312,7 +324,10 @@ class AuxLossSampler(BaseGASampler):
         trial = study._storage.get_trial(trial._trial_id)
         claim = trial.system_attrs[PLACE_KEY]
         if claim["loss"] is not None:
-            return space.loss_to_params(AuxLoss.parse(claim["loss"]), self.operators)
+            params = space.loss_to_params(AuxLoss.parse(claim["loss"]), self.operators)
+            if taken := sorted(params.keys() - search_space.keys()):
+                raise ValueError(f"AuxLossSampler draws whole losses, another sampler must not fix {', '.join(taken)}")
+            return params
         # Enqueued: what the user left open is drawn at random, so that a valid loss comes out if there is one.
         given = {**trial.params, **trial.system_attrs.get("fixed_params", {})}
         rng = np.random.default_rng([claim["seed"], claim["stage"], claim["place"], claim["attempt"]])
@@ -402,13 +417,13 @@ class AuxLossSampler(BaseGASampler):
                 free = None
                 if is_copy:
                     if not register.is_shared(trial.number):
-                        return
+                        return wait.end()
                     self._give_back(study, trial)
                 elif not ahead or register.holders:  # who chooses first may bring the study's seed
                     is_given = bool(trial.params) or "fixed_params" in trial.system_attrs
                     free = self._nth_free(study, len(ahead), is_given)
                     if free is not None and self._take(study, trial, *free, is_given):
-                        return
+                        return wait.end()
                 running = [register.trials[number] for number in register.open if number != trial.number]
             if free is not None:  # two chose the same one, and both gave way
                 time.sleep(np.random.default_rng().uniform(0.0, 0.1))  # SB3 seeds the generators of the process
@@ -467,7 +482,9 @@ class AuxLossSampler(BaseGASampler):
 
     def _give_back(self, study: Study, trial: FrozenTrial) -> None:
         study._storage.set_trial_system_attr(trial._trial_id, PLACE_KEY, None)
-        self._evolution = None  # at the very beginning its seed may differ from the other's
+        self._refresh(study)
+        if self._evolution is not None and self._register.places and self._evolution.seed != self._study_seed():
+            self._evolution = None  # at the very beginning
 
     # Evolution.
 
@@ -495,10 +512,13 @@ class AuxLossSampler(BaseGASampler):
         return [holder for holder in holders if holder.state in FILLED]
 
     def _best(self, population: list[FrozenTrial], sign: float) -> list[FrozenTrial]:
-        """The best share of a stage; equal scores in the order of places, pruned trials behind all others."""
+        """
+        The best share of a stage; equal scores in the order of places, those that were pruned or have no finite score behind
+        all others.
+        """
 
         def rank(trial: FrozenTrial) -> tuple[bool, float]:
-            if trial.state == TrialState.PRUNED or trial.value is None:
+            if trial.state == TrialState.PRUNED or trial.value is None or not math.isfinite(trial.value):
                 return True, 0.0
             return False, -sign * trial.value
 
@@ -551,6 +571,11 @@ class _Wait:
         time.sleep(self.delay)
         self.delay = min(1.0, 1.5 * self.delay)
 
+    def end(self) -> None:
+        """The trial has its place."""
+        if self.shown:
+            self.study._storage.set_trial_user_attr(self.trial._trial_id, WAITING_KEY, None)
+
 
 class _Evolution:
     """
@@ -570,9 +595,10 @@ class _Evolution:
         self.plans: defaultdict[int, list[Candidate]] = defaultdict(list)
         self.seen: dict[AuxLoss, None] = {}  # canonical forms, in the order in which they came
         self.model = TokenModel(sampler.max_horizon)
-        # Of each complete stage: all trials with their losses, and those of them that are parents.
+        # Of each complete stage: all trials with their losses, those of them that are parents, and that may be crossed.
         self._losses: list[list[tuple[int, AuxLoss]]] = []
         self._parents: list[list[tuple[int, AuxLoss]]] = []
+        self._crossed: list[list[tuple[int, AuxLoss]]] = []
         self._n_seen: dict[int, int] = {}  # how many there were when the random places of a stage were planned
 
     def complete_stages(self, register: _Register) -> int:
@@ -592,8 +618,12 @@ class _Evolution:
                 # A pruned trial counts with the score that it was pruned for.
                 scored = [(losses[trial.number], self.sign * trial.value) for trial in population if trial.value is not None]
                 self.model.add([loss for loss, _ in scored], [score for _, score in scored])
-            self._losses.append(list(losses.items()))
-            self._parents.append([(trial.number, losses[trial.number]) for trial in self.sampler._best(population, self.sign)])
+            everybody = list(losses.items())
+            parents = [(trial.number, losses[trial.number]) for trial in self.sampler._best(population, self.sign)]
+            pairs = [parent for parent in parents if _partners(*parent, parents)]
+            self._losses.append(everybody)
+            self._parents.append(parents)
+            self._crossed.append(pairs or [parent for parent in parents if _partners(*parent, everybody)])
 
     def candidate(self, stage: int, place: int, attempt: int) -> Candidate:
         """
@@ -681,14 +711,15 @@ class _Evolution:
             prior = space.PRIORS[place % len(space.PRIORS)]
             return Candidate(prior(rng, sampler.max_horizon, sampler.operators), operation)
         parents = self._parents[stage - 2]
-        number, loss = parents[rng.integers(len(parents))]
+        mothers = self._crossed[stage - 2] if operation == "crossover" else parents
+        if not mothers:
+            raise mutations.RejectedLoss(f"no parent has another candidate of its horizon in stage {stage - 1}")
+        number, loss = mothers[rng.integers(len(mothers))]
         if operation == "replacement":
             return Candidate(mutations.replacement(loss, rng, sampler.operators), operation, (number,))
         if operation == "horizon_change":
             return Candidate(mutations.horizon_change(loss, rng, sampler.max_horizon), operation, (number,))
         partners = _partners(number, loss, parents) or _partners(number, loss, self._losses[stage - 2])
-        if not partners:
-            raise mutations.RejectedLoss(f"no other loss of horizon {loss.horizon} in stage {stage - 1}")
         other_number, other = partners[rng.integers(len(partners))]
         return Candidate(mutations.crossover(loss, other, rng), operation, (number, other_number))
 

@@ -70,7 +70,12 @@ def loss_to_params(loss: AuxLoss, operators: Sequence[str] | None = None) -> dic
 
     :param loss: The loss
     :param operators: As in :func:`distributions`
+    :raises ValueError: when its operator, or negatives, are not in the space
     """
+    is_in_space = (loss.operator, loss.negatives) == ("mse", False) if operators is None else loss.operator in operators
+    if not is_in_space:
+        searched = "mean squared error without negatives" if operators is None else ", ".join(operators)
+        raise ValueError(f"{loss} is not in the space, whose operators are: {searched}")
     source, target = token_names(loss.horizon)
     params = {"horizon": loss.horizon, **dict(zip(source + target, loss.source + loss.target, strict=True))}
     return params if operators is None else {**params, "operator": loss.operator, "negatives": loss.negatives}

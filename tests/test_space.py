@@ -56,13 +56,19 @@ def test_parameters_and_back(loss: AuxLoss) -> None:
     assert params_to_loss(params) == loss
     assert params_to_loss({**params, "learning_rate": 1.0}) == loss
     assert set(params) == set(distributions(loss.horizon, operators=OPERATORS))
-    plain = loss_to_params(loss)
-    assert params_to_loss(plain) == AuxLoss(loss.horizon, loss.source, loss.target)
+    without = AuxLoss(loss.horizon, loss.source, loss.target)
+    plain = loss_to_params(without)
+    assert params_to_loss(plain) == without
     assert set(plain) == set(distributions(loss.horizon))
     assert suggest_aux_loss(FixedTrial(params), operators=OPERATORS) == loss
     for name in plain:
         with pytest.raises(KeyError):
             params_to_loss({key: value for key, value in plain.items() if key != name})
+    if loss != without:
+        with pytest.raises(ValueError, match="mean squared error without negatives"):
+            loss_to_params(loss)
+        with pytest.raises(ValueError, match="is not in the space, whose operators are: "):
+            loss_to_params(loss, [name for name in OPERATORS if name != loss.operator])
 
 
 def test_valid_is_what_aux_loss_accepts() -> None:
