@@ -6,13 +6,14 @@ from pathlib import Path
 
 import optuna
 import pytest
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
+from optuna_dashboard._note import get_note_from_system_attrs
 from program import aarl, start
 
 from search import evolve, workers
 from search.config import SearchConfig, load_config
 from search.sampler import AuxLossSampler
-from search.space import suggest_aux_loss
+from search.space import params_to_loss, suggest_aux_loss
 
 CONFIGS = sorted(Path("zoo_configs/search").glob("*.yml"))
 TINY = """\
@@ -118,6 +119,11 @@ def test_workers_need_nothing_but_the_storage(config: Path, tmp_path: Path) -> N
     assert (elsewhere / "runs/tiny/candidates").is_dir() and not (tmp_path / "runs/tiny/candidates").exists()
 
 
+def note_of(study: optuna.Study, trial: FrozenTrial) -> str:
+    attrs = study._storage.get_study_system_attrs(study._study_id)
+    return get_note_from_system_attrs(attrs, trial._trial_id)["body"]
+
+
 def test_the_end_of_a_clusters_job_is_an_interruption(config: Path, tmp_path: Path) -> None:
     config.write_text(TINY.replace("[40, 80]", "[40, 4000]"))
     (tmp_path / "own.yml").write_text(HYPERPARAMETERS.replace("80", "4000"))
@@ -131,6 +137,8 @@ def test_the_end_of_a_clusters_job_is_an_interruption(config: Path, tmp_path: Pa
     study = optuna.load_study(study_name="tiny", storage=evolve.open_storage(tmp_path / "runs/tiny", create=False))
     (trial,) = study.trials
     assert trial.state == TrialState.FAIL and trial.user_attrs["interrupted"]
+    note = note_of(study, trial)
+    assert f"Notation: `{params_to_loss(trial.params)}`" in note and "**State:** fail" in note
 
 
 def test_an_unknown_study_is_one_line(config: Path, tmp_path: Path) -> None:

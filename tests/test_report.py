@@ -20,7 +20,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from search.notation import mathml, subscripts
 from search.report import stage_rows, stored_baselines, stored_runs, time_spent, write_report
-from search.sampler import AuxLossSampler
+from search.sampler import AuxLossSampler, SearchComplete
 from search.space import distributions, loss_to_params, random_loss, suggest_aux_loss
 
 START = datetime(2026, 1, 1)
@@ -127,6 +127,12 @@ def test_places_of_a_search():
     rows = stage_rows(study)
     assert [(row.places, row.completed) for row in rows] == [(5, 5), (3, 2)]
     assert rows[0].best == min(trial.value for trial in study.trials[:5])
+    # One that is asked for when nothing is left to do has no place: no candidate of the search failed.
+    done = optuna.create_study(sampler=AuxLossSampler(n_random=2, n_prior=0, seed=0, n_stages=1), direction="minimize")
+    with pytest.raises(SearchComplete):
+        done.optimize(lambda trial: float(suggest_aux_loss(trial).horizon))
+    assert [trial.state for trial in done.trials][-1] == TrialState.FAIL
+    assert [(row.completed, row.failed) for row in stage_rows(done)] == [(2, 0)]
 
 
 def test_what_the_report_says(study, tmp_path):

@@ -3,8 +3,10 @@
 import copy
 import pickle
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ import numpy as np
 import optuna
 import pytest
 from optuna.pruners import HyperbandPruner, MedianPruner
-from optuna.samplers import RandomSampler
+from optuna.samplers import PartialFixedSampler, RandomSampler
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
 from search_worker import SETTINGS, DivergedError, diverges, open_storage, score, work
@@ -682,11 +684,50 @@ def test_a_study_does_not_go_on_with_other_settings(name: str, value: Any) -> No
         ({"parents": 0.0}, "parents must be a share"),
         ({"parents": 1.5}, "parents must be a share"),
         ({"operators": ("l2",)}, "'l2' is not"),
+        ({"seed": -1}, "seed must not be negative"),
+        ({"random": float("nan")}, "random must not be negative"),
+        ({"seed": np.int64(3)}, "seed must be an int"),
+        ({"n_random": 10.0}, "n_random must be an int"),
+        ({"screening": True}, "screening must be an int"),
     ],
 )
 def test_settings_that_do_not_fit_are_named(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         AuxLossSampler(**settings)
+
+
+def test_a_score_that_is_not_finite_makes_no_parent() -> None:
+    study = make_study(n_stages=2, population_size=4, n_random=4, n_prior=0)
+    for value in (1.0, np.inf, 3.0, 2.0):
+        trial = study.ask()
+        suggest_aux_loss(trial, 2)
+        study.tell(trial, value)
+    assert [trial.value for trial in study.sampler.select_parent(study, 1)] == [3.0]
+
+
+def test_another_sampler_must_not_fix_what_belongs_to_a_loss() -> None:
+    study = make_study()
+    study.sampler = PartialFixedSampler({"horizon": 1}, study.sampler)
+    trial = study.ask()
+    with pytest.raises(ValueError, match="must not fix horizon"):
+        suggest_aux_loss(trial, 2)
+
+
+def test_a_trial_that_waited_for_its_place_says_so_only_while_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    study = make_study(n_stages=2, population_size=4, n_random=1, n_prior=0, random=0.0, replacement=0.7)
+    monkeypatch.setattr(module, "ORPHAN_SECONDS", 6.0)
+    first = study.ask()
+    loss = suggest_aux_loss(first, 2)
+    with ThreadPoolExecutor() as pool:
+        second = pool.submit(study.ask)
+        deadline = time.monotonic() + 60
+        while len(study.trials) < 2 or "waiting" not in study.trials[1].user_attrs:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        study.tell(first, score(loss))
+        second.result()
+    assert place_of(study.trials[1])[0] == 2
+    assert study.trials[1].user_attrs["waiting"] is None
 
 
 def test_several_objectives_are_refused() -> None:

@@ -12,6 +12,7 @@ import optuna
 import pytest
 import yaml
 from optuna.trial import TrialState
+from optuna_dashboard._custom_plot_data import get_plotly_graph_objects
 from program import aarl, start
 
 from sb3_aarl import AuxLoss
@@ -133,6 +134,10 @@ def test_the_other_procedures_on_a_finished_search(config: Path, tmp_path: Path)
     assert "CURL" in aarl("baselines", config, "--workers", 2, folder=tmp_path)
     scores = {trial.user_attrs["variant"]: trial.value for trial in trials(tmp_path, "small-baselines")}
     assert scores.keys() == {"CURL", "SAC"}
+    # They are in the plot of the search although it was over before.
+    study = optuna.load_study(study_name="small", storage=open_storage(tmp_path / "runs/small"))
+    plots = get_plotly_graph_objects(study._storage.get_study_system_attrs(study._study_id))
+    assert all(name in plots["evolution"] for name in scores)
 
     output = aarl("cross-validate", config, "--study", "small", "--top", 2, "--workers", 2, folder=tmp_path)
     runs = trials(tmp_path, "small-cross-validation")
