@@ -219,7 +219,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, default=8)
     parser.add_argument("--stages", type=int, default=4, help="of 30 candidates each")
-    parser.add_argument("--seconds", type=float, default=4.0, help="mean time between two kills; on a busy machine more: workers have to live until they have begun")
+    often = "mean time between two kills; more where workers take long to begin: all of them must not die before"
+    parser.add_argument("--seconds", type=float, default=4.0, help=often)
     parser.add_argument("--storages", nargs="+", default=["sqlite", "postgresql"], choices=["sqlite", "postgresql"])
     parser.add_argument("--seed", type=int, default=0, help="of the killer")
     parser.add_argument("--out", type=Path)
