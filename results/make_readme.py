@@ -5,7 +5,6 @@ A folder here is what ``aarl benchmark`` leaves, without its storage and the che
 stands in its about.md, the first line being its title; numbers do not belong there.
 """
 
-import argparse
 import os
 import shlex
 import statistics
@@ -142,15 +141,8 @@ def cost(abouts: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Write README.md, or say with ``--check`` that it is not what the runs say."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", help="write nothing, fail if README.md is not what would be written")
-    arguments = parser.parse_args()
-    path, text = RESULTS / "README.md", readme(RESULTS)
-    if not arguments.check:
-        path.write_text(text, encoding="utf-8")
-    elif path.read_text(encoding="utf-8") != text:
-        sys.exit(f"{path} is not what its runs say: python results/{Path(__file__).name}")
+    """Write README.md; tests/test_results.py compares it."""
+    (RESULTS / "README.md").write_text(readme(RESULTS), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -282,10 +282,13 @@ def importances(
     varied = {name: sorted(trials[name].unique().tolist()) for name in ("operator", "negatives") if trials[name].nunique() > 1}
     space = distributions(longest, longest) | {name: CategoricalDistribution(choices) for name, choices in varied.items()}
     tokens = {name: False for name, distribution in distributions(longest).items() if name != "horizon"}
-    masks = [AuxLoss(loss.horizon, loss.source, loss.target) for loss in trials["loss"]]
     params = [
-        {**tokens, **loss_to_params(mask), **{name: getattr(loss, name) for name in varied}}
-        for mask, loss in zip(masks, trials["loss"], strict=True)
+        {
+            **tokens,
+            **loss_to_params(AuxLoss(loss.horizon, loss.source, loss.target)),
+            **{name: getattr(loss, name) for name in varied},
+        }
+        for loss in trials["loss"]
     ]
     study = _quiet_study(direction)
     study.add_trials(
