@@ -24,7 +24,7 @@ from search.objective import CandidateFailed, DiskError, Objective, causes, chec
 from search.pool import Pool, uninterrupted
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
-from search.storage import HEARTBEAT_INTERVAL, PATIENCE, ServerLost, load_study, open_storage
+from search.storage import HEARTBEAT_INTERVAL, PATIENCE, Outlasting, ServerLost, load_study, open_storage
 from search.trials import loss_of, ranked
 
 logger = logging.getLogger(__name__)
@@ -177,7 +177,8 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
     objective = Objective(config, folder / "candidates", on_begin=begun)
 
     def finished(study: optuna.Study, trial: FrozenTrial) -> None:
-        nonlocal failures
+        nonlocal current, failures
+        current = None
         with uninterrupted():
             annotate_trial(study, trial, artifacts)
         failures = failures + 1 if trial.state == TrialState.FAIL else 0
@@ -202,7 +203,9 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
             return
         except KeyboardInterrupt:
             if current is not None:  # Optuna calls nobody back then
-                with uninterrupted():
+                if isinstance(storage, Outlasting):
+                    storage.patience = 0.0  # a server that is away must not keep a worker that is to end
+                with uninterrupted(), contextlib.suppress(Exception):  # it is an interruption, whatever becomes of the note
                     annotate_trial(study, current, artifacts)
             raise
         except Exception as error:
