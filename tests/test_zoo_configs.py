@@ -150,8 +150,24 @@ def test_rl_zoo_reads_the_same(variant: str) -> None:
         assert entry == load_hyperparameters(path, env_id), env_id
 
 
+# What each file of choices/ changes, and of which variant.
+CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
+    "aarl_state_bf16": ("aarl_state", {"precision": "bf16"}),
+    "sac_dense_mlp_bf16": ("sac_dense_mlp", {"precision": "bf16"}),
+}
+
+
+def test_choices_differ_in_nothing_else() -> None:
+    assert {path.stem for path in (ZOO / "choices").glob("*.yml")} == CHOICES.keys()
+    for choice, (variant, changes) in CHOICES.items():
+        path = ZOO / "choices" / f"{choice}.yml"
+        for env_id in {*yaml.safe_load(path.read_text()), "dm_control/walker-walk-v0"} - {"default"}:
+            assert load_hyperparameters(path, env_id) == {**load_hyperparameters(ZOO / f"{variant}.yml", env_id), **changes}
+
+
 # All text that there is but environments and files; RL-Zoo would take any other for text too.
-WORDS = {"MlpPolicy", "CnnPolicy", "auto_0.1", "none", "random_crop", "aarl-state", "aarl-pixel", "curl", *encoders.ENCODERS}
+WORDS = {"MlpPolicy", "CnnPolicy", "auto_0.1", "bf16", "none", "random_crop", *encoders.ENCODERS}
+WORDS |= {"aarl-state", "aarl-pixel", "curl"}
 BASELINES = {"SAC", "CURL", "SAC (no aug)", "SAC-Identity", "SAC-DenseMLP", "CURL-DenseMLP"}
 
 
