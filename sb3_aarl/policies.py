@@ -92,6 +92,28 @@ def full_precision(x: th.Tensor) -> th.Tensor:
     return x.float() if x.dtype == th.bfloat16 else x
 
 
+class _FewRows(th.autograd.Function):
+    """
+    A linear layer whose backward pass leaves out what a loss of the smallest Q-value does not need: rows without gradient,
+    which every critic but the smallest has, and the layer's own parameters.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+        if th.is_autocast_enabled(x.device.type):
+            weight = weight.to(th.get_autocast_dtype(x.device.type))  # once: the backward pass needs it too
+        ctx.save_for_backward(weight)
+        return th.nn.functional.linear(x, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor, None, None]:
+        (gradient,), (weight,) = gradients, ctx.saved_tensors
+        rows = gradient.any(dim=1).nonzero().squeeze(1)
+        of_inputs = gradient.new_zeros(len(gradient), weight.shape[1])
+        of_inputs[rows] = gradient[rows] @ weight
+        return of_inputs, None, None
+
+
 class Trunk(NamedTuple):
     """
     Stands for observations whose encoding is known up to the projection, so that actor and critic need not do it twice.
@@ -214,6 +236,28 @@ class Critic(_CropsImages, ContinuousCritic):
         """
         inputs = th.cat([latent, actions], dim=1)
         return tuple(full_precision(q_network(inputs)) for q_network in self.q_networks)
+
+    def min_q_values(self, latent: th.Tensor, actions: th.Tensor, skip_rows: bool) -> th.Tensor:
+        """
+        The smallest Q-value of all critics, for the loss of the actor.
+
+        :param latent: Latent states (batch, features_dim)
+        :param actions: (batch, action_dim), scaled to [-1, 1]
+        :param skip_rows: Whether the backward pass leaves out what it does not need: the critics' own parameters and, a row
+            having gradients of one critic only, half of two critics' rows. That is faster on CPUs and rounds in another way;
+            a GPU would wait to know which rows, and does not do it
+        :return: (batch, 1)
+        """
+        if not skip_rows or latent.device.type != "cpu":
+            return th.cat(self.q_values(latent, actions), dim=1).min(dim=1, keepdim=True).values
+        values = []
+        for q_network in self.q_networks:
+            x = th.cat([latent, actions], dim=1)
+            assert isinstance(q_network, nn.Sequential)
+            for layer in q_network:
+                x = _FewRows.apply(x, layer.weight, layer.bias) if isinstance(layer, nn.Linear) else layer(x)
+            values.append(full_precision(x))
+        return th.cat(values, dim=1).min(dim=1, keepdim=True).values
 
 
 class SACAuxPolicy(SACPolicy):

@@ -536,7 +536,8 @@ class SACAux(SAC):
             with autocast:
                 with th.no_grad():
                     latent = self.critic.encode(obs)
-                min_q, _ = th.cat(self.critic.q_values(latent, actions_pi), dim=1).min(dim=1, keepdim=True)
+                # Without an auxiliary loss this may be SB3's SAC to the bit.
+                min_q = self.critic.min_q_values(latent, actions_pi, skip_rows=self.aux_head is not None)
             actor_loss = (ent_coef * log_prob - min_q).mean()
             log("actor_loss", actor_loss)
             self.actor.optimizer.zero_grad()

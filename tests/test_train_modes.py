@@ -9,6 +9,7 @@ import pytest
 import torch as th
 from test_sac_aux import KINDS, assert_same, everything, filled_model, make_model
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_aarl.cuda_graph import _key, _leaves, _map
 from sb3_aarl.sac_aux import NonFiniteError
@@ -101,6 +102,29 @@ def test_bfloat16_learns_as_float32_does() -> None:
         assert after["train/aux_loss"] < 0.5 * before["train/aux_loss"]
         values += [after["train/aux_loss"], after["train/critic_loss"]]
     assert found["bf16"] == pytest.approx(found["fp32"], rel=0.3)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("n_critics", [1, 2, 3])
+def test_the_actor_loss_leaves_out_critics_that_are_not_the_smallest(n_critics: int, precision: str) -> None:
+    model = filled_model(policy_kwargs={"n_critics": n_critics})
+    n_features = model.critic.features_extractor.features_dim
+    inputs = [th.randn(64, size, requires_grad=True) for size in (n_features, model.action_space.shape[0])]
+    found: list[tuple[th.Tensor, ...]] = []
+    work: list[int] = []
+    for skip_rows in (False, True):
+        with th.autocast("cpu", th.bfloat16, enabled=precision == "bf16"):
+            values = model.critic.min_q_values(*inputs, skip_rows)
+        with FlopCounterMode(display=False) as counter:
+            found.append((values, *th.autograd.grad(values.square().sum(), inputs, retain_graph=True)))
+        work.append(counter.get_total_flops())
+    assert work[0] == n_critics * work[1] > 0
+    for expected, given in zip(*found, strict=True):
+        assert_same(given.dtype, expected.dtype)
+        scale = expected.abs().max().item()
+        th.testing.assert_close(given, expected, rtol=0, atol=scale * (1e-6 if precision == "fp32" else 1e-2))
+    values.sum().backward()
+    assert all(parameter.grad is None for parameter in model.critic.parameters())
 
 
 @pytest.mark.parametrize("given", [{}, {"foreach": True}, {"fused": False}, {"eps": 1e-3}], ids=str)
