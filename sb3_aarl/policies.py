@@ -108,9 +108,9 @@ class _FewRows(th.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor, None, None]:
         (gradient,), (weight,) = gradients, ctx.saved_tensors
-        rows = gradient.any(dim=1).nonzero().squeeze(1)
+        rows = gradient.abs().sum(dim=1).nonzero().squeeze(1)  # several times faster than any()
         of_inputs = gradient.new_zeros(len(gradient), weight.shape[1])
-        of_inputs[rows] = gradient[rows] @ weight
+        of_inputs.index_copy_(0, rows, gradient.index_select(0, rows) @ weight)
         return of_inputs, None, None
 
 
