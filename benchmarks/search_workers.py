@@ -19,7 +19,6 @@ import optuna
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 
-from search import workers
 from search.provenance import save_result
 from search.sampler import AuxLossSampler, SearchComplete
 from search.space import params_to_loss, suggest_aux_loss
@@ -36,7 +35,7 @@ def open_storage(kind: str, folder: str) -> BaseStorage:
 def work(start: Any, results: Any, kind: str, folder: str, n_stages: int, seconds: float) -> None:
     """One worker; reports its asks and errors."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    sampler = AuxLossSampler(seed=0, n_stages=n_stages, worker=workers.identity())
+    sampler = AuxLossSampler(seed=0, n_stages=n_stages)
     study = optuna.load_study(study_name="study", storage=open_storage(kind, folder), sampler=sampler)
     rng = np.random.default_rng()
     start.wait()

@@ -26,7 +26,6 @@ import psutil
 from optuna.samplers import BaseSampler, NSGAIISampler
 from optuna.trial import TrialState
 
-from search import workers
 from search.provenance import save_result
 from search.sampler import PLACE_KEY, AuxLossSampler
 from search.space import suggest_aux_loss
@@ -38,7 +37,7 @@ from postgres import Postgres, free_port
 STUDY = "load"
 STARTING = 120  # seconds: a worker imports PyTorch
 SAMPLERS: dict[str, Callable[[int, int], BaseSampler]] = {
-    "AuxLossSampler": lambda seed, horizon: AuxLossSampler(seed=0, max_horizon=horizon, worker=workers.identity()),
+    "AuxLossSampler": lambda seed, horizon: AuxLossSampler(seed=0, max_horizon=horizon),
     "NSGAIISampler": lambda seed, _: NSGAIISampler(population_size=100, seed=seed),
 }
 

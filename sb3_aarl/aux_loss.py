@@ -206,7 +206,8 @@ class AuxLoss:
 
 
 # Configurations are plain YAML: a loss is written as a mapping, never as a Python object.
-yaml.SafeDumper.add_representer(AuxLoss, lambda dumper, loss: dumper.represent_dict(loss.to_dict()))
+for _dumper in (yaml.SafeDumper, yaml.Dumper):
+    _dumper.add_representer(AuxLoss, lambda dumper, loss: dumper.represent_dict(loss.to_dict()))
 
 
 def _checked_horizon(horizon: Any) -> int:

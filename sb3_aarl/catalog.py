@@ -31,6 +31,11 @@ class PublishedLoss(NamedTuple):
     stage: int
     rank: int
 
+    @property
+    def name(self) -> str:
+        """What :func:`load` knows it by: task, observation, stage and rank, such as ``cheetah-run-state-4-1``."""
+        return f"{self.environment.lower()}-{self.observation}-{self.stage}-{self.rank}"
+
 
 @cache
 def _read() -> dict[str, Any]:
@@ -50,7 +55,7 @@ def _named() -> Mapping[str, AuxLoss]:
 
 
 def names() -> list[str]:
-    """The names that :func:`load` knows, sorted; numbers in them by value."""
+    """The names of all losses but the published candidates, sorted; numbers in them by value."""
     return sorted(_named(), key=lambda name: (name.rstrip("0123456789"), len(name), name))
 
 
@@ -58,15 +63,18 @@ def load(name: str) -> AuxLoss:
     """
     The loss of that name.
 
-    :param name: One of :func:`names`
+    :param name: One of :func:`names`, or a published candidate's; capitals are as good
     :raises ValueError: for an unknown name, with the nearest ones
     """
-    try:
-        return _named()[name]
-    except (KeyError, TypeError):
-        nearest = difflib.get_close_matches(str(name).lower(), names(), cutoff=0.4)
+    key = str(name).strip().lower()
+    if key in _named():
+        return _named()[key]
+    candidates = {candidate.name: candidate.loss for candidate in published()}
+    if key not in candidates:
+        nearest = difflib.get_close_matches(key[:100], [*names(), *candidates], cutoff=0.4)
         hint = f"nearest: {', '.join(nearest)}" if nearest else f"known: {', '.join(names())}"
-        raise ValueError(f"unknown auxiliary loss {name!r}, {hint}") from None
+        raise ValueError(f"unknown auxiliary loss {name!r}, {hint}")
+    return candidates[key]
 
 
 @cache

@@ -112,13 +112,15 @@ def train(
 
 
 @app.command()
-def losses() -> None:
+def losses(
+    published: Annotated[bool, typer.Option("--published", help="The paper's candidates too.")] = False,
+) -> None:
     """List the losses that have a name."""
     from sb3_aarl import catalog
 
     table = Table("name", "notation", "operator")
     table.columns[1].overflow = "fold"
-    for name in catalog.names():
+    for name in [*catalog.names(), *(candidate.name for candidate in catalog.published() if published)]:
         loss = catalog.load(name)
         operator = f"{loss.operator}, negatives" if loss.negatives else loss.operator
         # The brackets behind a notation hold the operator; rich would take them for markup.

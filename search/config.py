@@ -271,10 +271,10 @@ def resolve_env_id(name: str) -> str:
     """
     The id of an environment.
 
-    :param name: A registered id, or the short form of a DeepMind Control task, such as ``cheetah-run``
+    :param name: A registered id, or the short form of a DeepMind Control task, such as ``cheetah-run`` or ``Cheetah-Run``
     :raises ValueError: for an unknown one, with the nearest
     """
-    full = f"{PREFIX}{name}-v0"
+    full = f"{PREFIX}{name.lower()}-v0"
     if full in env_ids():
         return full
     # Not gym.spec or gym.make, which import what stands before a colon.

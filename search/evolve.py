@@ -163,7 +163,7 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # it shows a failed trial with all of its traceback
     storage = open_storage(where, create=False, patience=PATIENCE, heartbeat_interval=heartbeat)
     config = stored_config(load_study(storage, name), folder)
-    sampler = AuxLossSampler(**config.sampler_settings(), worker=workers.identity())
+    sampler = AuxLossSampler(**config.sampler_settings())
     study = optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=make_pruner(config))
     artifacts = _artifacts(folder)
     failures = 0

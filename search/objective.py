@@ -347,12 +347,11 @@ def make_pruner(config: SearchConfig) -> BasePruner:
 
 def _name(trial: optuna.Trial) -> str:
     """The same for a trial that takes up what another one, killed, had begun."""
-    # From the storage: a Trial shows its user attributes as they were before the sampler gave it a place.
-    frozen = trial.study._storage.get_trial(trial._trial_id)
-    if "stage" in frozen.user_attrs:
-        return f"stage-{frozen.user_attrs['stage']}-place-{frozen.user_attrs['place']}"
+    if "stage" in trial.user_attrs:
+        return f"stage-{trial.user_attrs['stage']}-place-{trial.user_attrs['place']}"
     # Other samplers may propose a loss twice at the same time. A heartbeat's copy knows whose copy it is.
-    return f"trial-{frozen.system_attrs.get('failed_trial', frozen.number)}"
+    system_attrs = trial.study._storage.get_trial_system_attrs(trial._trial_id)
+    return f"trial-{system_attrs.get('failed_trial', trial.number)}"
 
 
 def _folder_name(study: optuna.Study, name: str, aux_loss: AuxLoss | None, environment: str, seeds: Sequence[int]) -> str:

@@ -2,6 +2,7 @@
 
 import bisect
 import contextlib
+import inspect
 import logging
 import math
 import threading
@@ -10,6 +11,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Container, Iterable, Sequence
 from itertools import islice
+from types import FrameType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +19,9 @@ from optuna.distributions import BaseDistribution
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.samplers import RandomSampler
 from optuna.samplers._ga import BaseGASampler
+from optuna.storages._heartbeat import is_heartbeat_enabled
 from optuna.study import Study, StudyDirection
+from optuna.study._optimize import _run_trial
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
@@ -177,14 +181,15 @@ class AuxLossSampler(BaseGASampler):
         the tokens, fitted to the stages before, rates highest under one posterior draw; 1 for the paper's evolution
     :param retries: How often a candidate is given out again after its worker died, before it is taken for the cause
     :param n_stages: Number of stages, after which ``ask`` raises :class:`SearchComplete`; None for no end
-    :param worker: Identity of this process (``workers.identity()``). Places of a worker of this machine that has died
-        are given out again, and where the storage has heartbeats, a trial has one as soon as it is asked for
-        (``study.optimize`` goes on with them). None where trials are told by another process than the one that asked
+    :param worker: Identity that each trial shows as its worker's; ``"auto"`` for that of the process that asks
+        (``workers.identity()``). Places of a worker of this machine that has died are given out again. None where trials are
+        told by another process than the one that asked, which may be gone by then
     :raises ValueError: naming the argument that does not fit
     :raises TypeError: naming the argument that is no int
 
-    A candidate that fails makes room for another one, unless its trial has the user attribute ``interrupted``: then the same
-    one is given out again. ``search.objective.end_noted`` sets it at Ctrl-C.
+    A candidate that fails makes room for another one. One whose program ended is given out again: at Ctrl-C, and when
+    ``study.optimize`` does not ``catch`` its exception, in which case it is one of the ``retries``. The same holds for a trial
+    that has the user attribute ``interrupted``, which ``search.objective.end_noted`` sets.
     """
 
     def __init__(
@@ -204,7 +209,7 @@ class AuxLossSampler(BaseGASampler):
         screening: int = 1,
         retries: int = RETRIES,
         n_stages: int | None = None,
-        worker: str | None = None,
+        worker: str | None = "auto",
     ):
         whole: dict[str, int | None] = {"population_size": population_size, "n_random": n_random, "n_prior": n_prior}
         whole |= {"max_horizon": max_horizon, "screening": screening, "retries": retries, "n_stages": n_stages, "seed": seed}
@@ -308,8 +313,8 @@ class AuxLossSampler(BaseGASampler):
         self._raise_error_if_multi_objective(study)
         try:
             if self.worker is not None:
-                study._storage.set_trial_user_attr(trial._trial_id, workers.WORKER_KEY, self.worker)
-                workers.beat(study._storage, trial._trial_id)
+                worker = workers.identity() if self.worker == "auto" else self.worker
+                _show(study, trial, workers.WORKER_KEY, worker)
             self._find_place(study, trial)
         except BaseException:
             # Interrupted while it waited, or nothing is left to do.
@@ -351,7 +356,13 @@ class AuxLossSampler(BaseGASampler):
 
     def after_trial(self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None) -> None:
         """Mark a candidate that failed in a live worker, or was pruned as invalid: its place gets another one."""
-        failed = state == TrialState.FAIL and not trial.user_attrs.get("interrupted")
+        error = None if (frame := _in_optimize()) is None else frame.f_locals.get("func_err")
+        if isinstance(error, KeyboardInterrupt):
+            study._storage.set_trial_user_attr(trial._trial_id, "interrupted", True)
+            return
+        # What study.optimize does not catch ends the program: it is started again as after any other death.
+        ends = frame is not None and error is not None and not isinstance(error, frame.f_locals["catch"])
+        failed = state == TrialState.FAIL and not trial.user_attrs.get("interrupted") and not ends
         if failed or (state == TrialState.PRUNED and loss_of(trial) is None):
             study._storage.set_trial_system_attr(trial._trial_id, REJECTED_KEY, True)
 
@@ -406,7 +417,8 @@ class AuxLossSampler(BaseGASampler):
                 raise ValueError(f"this study was begun with {name}={begun.get(name)!r}, not {value!r}: use another study")
 
     def _find_place(self, study: Study, trial: FrozenTrial) -> None:
-        wait = _Wait(study, trial, beats=self.worker is not None)
+        # Signs of life from the beginning on, where study.optimize will go on with them.
+        wait = _Wait(study, trial, beats=_in_optimize() is not None)
         while True:
             with self._lock:
                 self._refresh(study)
@@ -428,8 +440,7 @@ class AuxLossSampler(BaseGASampler):
             if free is not None:  # two chose the same one, and both gave way
                 time.sleep(np.random.default_rng().uniform(0.0, 0.1))  # SB3 seeds the generators of the process
                 continue
-            if self.worker is not None:
-                workers.fail_dead(study, running)
+            workers.fail_dead(study, running)
             wait.pause(ahead, running)
 
     def _nth_free(self, study: Study, n: int, enqueued: bool = False) -> tuple[int, int] | None:
@@ -477,7 +488,7 @@ class AuxLossSampler(BaseGASampler):
             logger.warning("Trial %d is given up for another candidate: %s", replaced, reason)
             shown["replaces"] = replaced
         for key, value in shown.items():
-            storage.set_trial_user_attr(trial_id, key, value)
+            _show(study, trial, key, value)
         return True
 
     def _give_back(self, study: Study, trial: FrozenTrial) -> None:
@@ -525,6 +536,23 @@ class AuxLossSampler(BaseGASampler):
         return sorted(population, key=rank)[: max(1, round(self.parents * len(population)))]
 
 
+def _in_optimize() -> FrameType | None:
+    """
+    The frame in which ``study.optimize`` runs the trial that it asks for or tells of, None outside of it. Optuna does not tell
+    a sampler why a trial failed.
+    """
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_code is not _run_trial.__code__:
+        frame = frame.f_back
+    return frame
+
+
+def _show(study: Study, trial: FrozenTrial, key: str, value: Any) -> None:
+    """Set a user attribute of a trial that is asked for; ``trial.user_attrs`` in the objective has it too."""
+    study._storage.set_trial_user_attr(trial._trial_id, key, value)
+    trial.user_attrs[key] = value
+
+
 def _is_invalid(trial: FrozenTrial) -> bool:
     """Whether a trial was pruned because it was no loss: that costs nothing, and fills no place."""
     return trial.state == TrialState.PRUNED and REJECTED_KEY in trial.system_attrs
@@ -536,17 +564,28 @@ class _Wait:
     def __init__(self, study: Study, trial: FrozenTrial, beats: bool):
         self.study = study
         self.trial = trial
-        self.beats = beats
+        storage: Any = study._storage
+        # Twice in an interval, as long as this waits.
+        self.beat_every = storage.get_heartbeat_interval() / 2 if beats and is_heartbeat_enabled(storage) else math.inf
+        self.beaten = -math.inf
+        self.beat()
         self.delay = 0.001
         self.queue: list[int] = []
         self.shown = 0.0
         self.signs: dict[int, tuple[Any, float]] = {}
+
+    def beat(self) -> None:
+        """Give a sign of life, where it is time for one."""
+        if time.monotonic() - self.beaten >= self.beat_every:
+            self.beaten = time.monotonic()
+            workers.beat(self.study._storage, self.trial._trial_id)
 
     def pause(self, ahead: list[FrozenTrial], running: list[FrozenTrial]) -> None:
         """
         :param ahead: Trials that have to choose a place before
         :param running: Trials whose places may become free, or whose stage may end
         """
+        self.beat()
         now = time.monotonic()
         queue = [other.number for other in ahead]
         if queue != self.queue:  # it moves: the turn of this trial may be near
@@ -560,8 +599,6 @@ class _Wait:
                 workers.fail(self.study, other, "its worker died before it got a place")
         if now - self.shown > ORPHAN_SECONDS / 6 and self.delay > 0.1:
             self.shown = now
-            if self.beats:
-                workers.beat(self.study._storage, self.trial._trial_id)
             logger.info("Trial %d waits for a place: %d trials run", self.trial.number, len(running))
             # Changes each time: a sign of life for the trials behind this one.
             storage = self.study._storage

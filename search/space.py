@@ -101,14 +101,16 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
     :param max_horizon: Longest horizon of the space
     :param operators: Operators to search too, with and without negatives; None for mean squared error without
     :raises optuna.TrialPruned: when the sampler proposes what is not valid; nothing was trained then
-    :raises ValueError: when AuxLossSampler searches another space
+    :raises ValueError: when AuxLossSampler searches a larger space, or other operators
     """
     check_operators(operators)
     # Optuna would draw anew what does not fit, and train another loss than the sampler took note of.
     sampler = getattr(getattr(trial, "study", None), "sampler", None)
-    asked_for = {"max_horizon": max_horizon, "operators": None if operators is None else tuple(operators)}
-    for name, value in asked_for.items():
-        searched = getattr(sampler, name, value)
+    given = None if operators is None else tuple(operators)
+    for name, value, searched in (
+        ("max_horizon", max_horizon, max(max_horizon, getattr(sampler, "max_horizon", 0))),
+        ("operators", given, getattr(sampler, "operators", given)),
+    ):
         if searched != value:
             raise ValueError(f"the sampler searches with {name}={searched!r}, suggest_aux_loss asks for {name}={value!r}")
     horizon = trial.suggest_int("horizon", 1, max_horizon)

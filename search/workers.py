@@ -85,18 +85,17 @@ def fail(study: Study, trial: FrozenTrial, reason: str) -> bool:
         return False
 
 
-def beat(of: Study | BaseStorage, trial_id: int) -> None:
+def beat(storage: BaseStorage, trial_id: int) -> None:
     """
     Give a sign of life for a running trial, where the storage keeps them.
 
     ``study.optimize`` does so while the objective runs; this is for the time before, in which a trial is asked for.
 
-    :param of: Study or storage
+    :param storage: The storage
     :param trial_id: Identity of the trial in the storage, not its number
     """
-    storage: Any = of._storage if isinstance(of, Study) else of
     if is_heartbeat_enabled(storage):
-        storage.record_heartbeat(trial_id)
+        storage.record_heartbeat(trial_id)  # type: ignore[attr-defined]
 
 
 def fail_dead(study: Study, trials: Iterable[FrozenTrial], all_have_names: bool = False) -> int:

@@ -11,7 +11,6 @@ from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 
 from sb3_aarl.aux_loss import AuxLoss
-from search import workers
 from search.sampler import AuxLossSampler, SearchComplete
 from search.space import suggest_aux_loss
 
@@ -75,7 +74,7 @@ def work(
             raise DivergedError(str(loss))
         return score(loss)
 
-    sampler = Sampler(**settings, seed=seed, worker=workers.identity())
+    sampler = Sampler(**settings, seed=seed)
     study = optuna.load_study(study_name="study", storage=open_storage(kind, folder), sampler=sampler)
     start.wait()
     try:

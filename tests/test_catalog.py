@@ -68,7 +68,7 @@ def test_names() -> None:
     "name, nearest",
     [
         ("crul", "curl"),
-        ("CURL", "curl"),
+        ("CRUL", "curl"),
         ("forward-dynamic", "forward-dynamics"),
         ("aarl_pixel", "aarl-pixel"),
         ("spr-11", "spr-1"),
@@ -81,6 +81,15 @@ def test_unknown_names_list_the_nearest(name: str, nearest: str, look_up) -> Non
     with pytest.raises(ValueError, match=f"unknown auxiliary loss '{name}'") as error:
         look_up(name)
     assert nearest in str(error.value).partition(", ")[2]
+
+
+def test_capitals_and_published_candidates() -> None:
+    for name in ("AARL-State", "CURL", " curl", "Atc-3"):
+        assert catalog.load(name) == catalog.load(name.strip().lower())
+    published = catalog.published()
+    assert len({candidate.name for candidate in published}) == len(published) == 124
+    assert all(catalog.resolve(candidate.name) == candidate.loss for candidate in published)
+    assert catalog.load("cheetah-run-state-4-4") == catalog.load("aarl-state")
 
 
 def test_resolve() -> None:

@@ -233,6 +233,7 @@ def test_merging(one: dict[str, Any], other: dict[str, Any]) -> None:
 
 def test_short_names_of_environments() -> None:
     assert resolve_env_id("cheetah-run") == resolve_env_id("dm_control/cheetah-run-v0") == "dm_control/cheetah-run-v0"
+    assert resolve_env_id("Cheetah-Run") == "dm_control/cheetah-run-v0"  # the paper's
     assert resolve_env_id("Pendulum-v1") == "Pendulum-v1"
     with pytest.raises(ValueError, match="cheetah-run"):
         resolve_env_id("chetah-run")

@@ -338,7 +338,7 @@ from search.storage import open_storage
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 study = optuna.load_study(study_name="study", storage=open_storage(sys.argv[1], heartbeat_interval=1))
 def objective(trial):
-    workers.beat(study, trial._trial_id)
+    workers.beat(study._storage, trial._trial_id)
     print(trial.number, flush=True)
     time.sleep(60)
 study.optimize(objective, n_trials=1)
@@ -382,7 +382,7 @@ def test_the_trial_of_a_stopped_worker_fails_and_that_of_a_live_one_does_not(
         assert trials[number].user_attrs["reason"] == "no sign of life from its worker for 2 seconds"
         assert [trial.state for trial in trials if trial.number != number] == [TrialState.RUNNING, TrialState.COMPLETE]
         # Late signs are no error.
-        workers.beat(study, trials[number]._trial_id)
+        workers.beat(study._storage, trials[number]._trial_id)
         workers.beat(storage, silent._trial_id)
         assert study.trials[number].state == TrialState.FAIL
 
@@ -394,12 +394,12 @@ def test_workers_of_the_proxy_and_of_its_database_see_each_other(url: str) -> No
         optuna.create_study(study_name="both", storage=ways[0])
         studies = [optuna.load_study(study_name="both", storage=way) for way in ways]
         for study in studies:
-            workers.beat(study, study.ask()._trial_id)
+            workers.beat(study._storage, study.ask()._trial_id)
         deadline = time.monotonic() + 30
         # Each watches; only the first worker still gives signs of life.
         while studies[0].trials[1].state == TrialState.RUNNING:
             assert time.monotonic() < deadline
-            workers.beat(studies[0], studies[0].trials[0]._trial_id)
+            workers.beat(studies[0]._storage, studies[0].trials[0]._trial_id)
             for study in studies:
                 workers.fail_dead(study, [])
             time.sleep(0.1)
@@ -413,7 +413,7 @@ def test_workers_of_the_proxy_and_of_its_database_see_each_other(url: str) -> No
 def test_a_worker_is_judged_by_its_own_interval(tmp_path: Path) -> None:
     slow, fast = (open_storage(tmp_path, heartbeat_interval=seconds) for seconds in (60, 1))
     study = optuna.create_study(study_name="study", storage=slow)
-    workers.beat(study, study.ask()._trial_id)
+    workers.beat(study._storage, study.ask()._trial_id)
     watching = optuna.load_study(study_name="study", storage=fast)
     deadline = time.monotonic() + 3
     while time.monotonic() < deadline:
@@ -426,7 +426,7 @@ def test_a_worker_is_judged_by_its_own_interval(tmp_path: Path) -> None:
 def test_nobody_is_blamed_for_a_time_in_which_nobody_looked(kind: str, tmp_path: Path) -> None:
     where = str(tmp_path) if kind == "journal" else f"sqlite:///{tmp_path}/study.db"
     study = optuna.create_study(storage=open_storage(where, heartbeat_interval=1))
-    workers.beat(study, study.ask()._trial_id)
+    workers.beat(study._storage, study.ask()._trial_id)
     for _ in range(2):  # all have slept: a laptop's lid, a server that was away
         assert workers.fail_dead(study, []) == 0
         time.sleep(2.1)

@@ -62,7 +62,7 @@ def fill_places(folder: Path) -> None:
             time.sleep(0.02)
         return float(sum(loss.target) - sum(loss.source))
 
-    sampler = AuxLossSampler(**SETTINGS, seed=0, worker=workers.identity())
+    sampler = AuxLossSampler(**SETTINGS, seed=0)
     study = optuna.load_study(study_name="study", storage=open_storage(folder), sampler=sampler)
     workers.fail_dead(study, study.trials)
     try:

@@ -53,13 +53,12 @@ def placed(study: optuna.Study) -> list[FrozenTrial]:
     return [trial for trial in study.get_trials() if trial.system_attrs.get(PLACE_KEY) is not None]
 
 
-def place_of(trial: FrozenTrial) -> tuple[int, int]:
+def place_of(trial: FrozenTrial | optuna.Trial) -> tuple[int, int]:
     return trial.user_attrs["stage"], trial.user_attrs["place"]
 
 
 def ask_for_place(study: optuna.Study) -> tuple[int, int]:
-    trial = study.ask()
-    return place_of(study.trials[trial.number])
+    return place_of(study.ask())
 
 
 def issued(study: optuna.Study) -> dict[tuple[int, int, int], tuple[str, str, list[tuple[int, int]]]]:
@@ -427,6 +426,52 @@ def test_the_place_of_a_dead_worker_gets_the_same_candidate_and_that_of_a_failed
     assert suggest_aux_loss(study.ask(), 2) != losses[3]
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("a mistake in the program")], ids=repr)
+def test_a_program_that_ends_in_its_objective_goes_on_with_the_same_candidate(error: BaseException) -> None:
+    study = make_study()
+
+    def ends(trial: optuna.Trial) -> float:
+        loss = suggest_aux_loss(trial, 2)
+        if trial.number in (0, 3, 4, 15, 30):
+            raise error
+        return score(loss)
+
+    for _ in range(5):
+        with pytest.raises(type(error)):
+            study.optimize(ends, catch=(DivergedError,))
+    assert sum(trial.state == TrialState.FAIL for trial in study.trials) == 5 + sum(key[2] > 0 for key in issued(run(study)))
+    undisturbed = run(make_study())
+    assert issued(study) == issued(undisturbed) and filled_places(study) == filled_places(undisturbed)
+
+
+def test_the_objective_sees_stage_operation_and_parents() -> None:
+    seen = {}
+
+    def objective(trial: optuna.Trial) -> float:
+        seen[trial.number] = trial.user_attrs
+        return score(suggest_aux_loss(trial, 2))
+
+    study = make_study(n_stages=2)
+    with pytest.raises(SearchComplete):
+        study.optimize(objective, catch=(DivergedError,))
+    keys = {"stage", "place", "operation", "parents", "worker"}
+    for number, attributes in seen.items():
+        assert attributes == study.trials[number].user_attrs and attributes.keys() - {"replaces"} == keys
+    assert any(attributes["parents"] for attributes in seen.values())
+
+
+@pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
+def test_without_names_the_dead_are_known_by_their_hearts(tmp_path: Path) -> None:
+    storage = RDBStorage(f"sqlite:///{tmp_path}/study.db", heartbeat_interval=1, grace_period=2)
+    study = make_study(storage=storage, n_random=2, n_prior=0, n_stages=1, worker=None)
+    trial = study.ask()
+    storage.record_heartbeat(trial._trial_id)  # and never again
+    run(study)
+    assert "worker" not in trial.user_attrs and "no sign of life" in study.trials[0].user_attrs["reason"]
+    assert [place_of(trial) for trial in study.trials[:3]] == [(1, 0), (1, 1), (1, 0)]
+    assert study.trials[0].system_attrs[PLACE_KEY] == study.trials[2].system_attrs[PLACE_KEY]
+
+
 def test_a_trial_that_never_chooses_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     study = make_study()
     monkeypatch.setattr(module, "ORPHAN_SECONDS", 0.01)
@@ -541,7 +586,7 @@ def heartbeat_study(monkeypatch: pytest.MonkeyPatch) -> tuple[optuna.Study, Call
             grace_period=120,
             heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(),
         )
-    study = make_study(storage=storage, worker=workers.identity(), n_random=2, n_prior=0, n_stages=2)
+    study = make_study(storage=storage, n_random=2, n_prior=0, n_stages=2)
 
     def stop(trial: optuna.Trial) -> None:
         monkeypatch.setattr(storage, "_get_stale_trial_ids", lambda study_id: [trial._trial_id])

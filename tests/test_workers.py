@@ -111,16 +111,16 @@ def test_failing_a_trial_that_has_finished_changes_nothing() -> None:
 
 def test_signs_of_life_are_given_where_the_storage_keeps_them(tmp_path: Path) -> None:
     in_memory = optuna.create_study()
-    workers.beat(in_memory, in_memory.ask()._trial_id)
+    workers.beat(in_memory._storage, in_memory.ask()._trial_id)
     assert in_memory.trials[0].system_attrs == {}
     study = optuna.create_study(storage=open_storage(tmp_path, heartbeat_interval=1))
     with pytest.warns(UserWarning, match="Heartbeat"):
         trial = study.ask()
     signs = []
-    for of in (study, study._storage):
-        workers.beat(of, trial._trial_id)
+    for _ in range(2):
+        workers.beat(study._storage, trial._trial_id)
         signs.append(tuple(study.trials[0].system_attrs[HEARTBEAT_KEY]))
     assert len(set(signs)) == 2
     study.tell(trial, 1.0)
-    workers.beat(study, trial._trial_id)
+    workers.beat(study._storage, trial._trial_id)
     assert tuple(study.trials[0].system_attrs[HEARTBEAT_KEY]) == signs[-1]
