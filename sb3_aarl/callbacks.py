@@ -1,6 +1,7 @@
 """Learning curve at fixed environment steps, and the area under it (AULC)."""
 
 import csv
+import io
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -186,6 +187,19 @@ class LearningCurveCallback(BaseCallback):
         return aulc(self.curve)
 
 
+def replace_text(path: Path, text: str) -> None:
+    """
+    Write a file in one step: others may read it, or write it too, at any time.
+
+    :param path: The file; its folder is made if it is not there
+    :param text: What will be in it, line ends as they are
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    unfinished.write_text(text, encoding="utf-8", newline="")
+    unfinished.replace(path)
+
+
 def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:
     """
     Write a learning curve as CSV, one evaluation a line; an old file is replaced in one step.
@@ -193,13 +207,11 @@ def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:
     :param path: The file; its folder is made if it is not there
     :param curve: The evaluations
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # two may write at once
-    with unfinished.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(Evaluation._fields)
-        writer.writerows(curve)
-    unfinished.replace(path)
+    file = io.StringIO(newline="")
+    writer = csv.writer(file)
+    writer.writerow(Evaluation._fields)
+    writer.writerows(curve)
+    replace_text(path, file.getvalue())
 
 
 def read_curve(path: str | Path) -> list[Evaluation]:

@@ -15,7 +15,7 @@ import pandas as pd
 import torch as th
 
 from sb3_aarl import catalog
-from sb3_aarl.callbacks import read_curve
+from sb3_aarl.callbacks import read_curve, replace_text
 from sb3_aarl.envs import PREFIX
 from search.config import ConfigError, action_repeat, load_hyperparameters, named_environments, resolve_env_id
 from search.grid import SCORELESS, Cell, all_cells, check_training
@@ -146,8 +146,10 @@ class Benchmark:
                 _write_about(path, self.about(cell))
         for path, about in read_abouts(folder)[0].items():
             environment = about["environment"]
-            if environment in self.checkpoints and about.get("evaluations") == self.evaluations(environment):
-                _write_about(path, {**about, "checkpoints": list(self.checkpoints[environment])})
+            of_now = list(self.checkpoints.get(environment, ()))
+            # Written only where it differs: a worker of another program may be adding to it.
+            if of_now not in ([], about.get("checkpoints")) and about.get("evaluations") == self.evaluations(environment):
+                _write_about(path, {**about, "checkpoints": of_now})
 
 
 def load_benchmark(
@@ -371,8 +373,4 @@ def _read_about(path: Path) -> dict[str, Any]:
 
 
 def _write_about(path: Path, about: Mapping[str, Any]) -> None:
-    """In one step: a table may read it at any time."""
-    path.mkdir(parents=True, exist_ok=True)
-    unfinished = path / f"{ABOUT}.tmp"
-    unfinished.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-    unfinished.replace(path / ABOUT)
+    replace_text(path / ABOUT, json.dumps(about, indent=1) + "\n")

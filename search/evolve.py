@@ -2,8 +2,6 @@
 
 import contextlib
 import logging
-import os
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
@@ -17,6 +15,7 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.callbacks import replace_text
 from search import grid, workers
 from search.config import SearchConfig, load_config
 from search.dashboard import annotate_study, annotate_trial, update_plots
@@ -129,13 +128,8 @@ def stored_config(study: optuna.Study, folder: Path) -> SearchConfig:
     if not is_text or Path(name).name != name:
         raise ValueError(f"study {name!r} has a configuration of another kind")
     folder = folder / "config"
-    folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():
-        # Other workers may be reading it.
-        descriptor, unfinished = tempfile.mkstemp(dir=folder)
-        with os.fdopen(descriptor, "w", encoding="utf-8") as opened:
-            opened.write(text)
-        os.replace(unfinished, folder / file)
+        replace_text(folder / file, text)  # other workers may be reading it
     return load_config(folder / f"{name}.yml")
 
 

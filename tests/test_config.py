@@ -4,16 +4,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
 import pytest
-import torch as th
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sb3_aarl import AuxLoss, SACAux, catalog
-from sb3_aarl.encoders import DenseMLP, PixelEncoder
 from search.config import ConfigError, SearchConfig, load_config, load_hyperparameters, merge, resolve_env_id
 from search.training import make_env
 
@@ -33,69 +29,6 @@ def write(folder: Path, config: Any = CONFIG, hyper: Any = HYPER) -> Path:
     for name, values in (("search.yml", config), ("hyper.yml", hyper)):
         (folder / name).write_text(values if isinstance(values, str) else yaml.safe_dump(values), encoding="utf-8")
     return folder / "search.yml"
-
-
-# The paper's tables, typed in a second time.
-
-
-def build(path: Path, env_id: str) -> SACAux:
-    """The model as a user would build it from the file."""
-    values = load_hyperparameters(path, env_id)
-    values.pop("n_timesteps")
-    env = make_env(env_id, values.pop("env_kwargs"))
-    return SACAux(values.pop("policy"), env, **{**values, "buffer_size": 10})
-
-
-@pytest.mark.parametrize(("task", "rate"), [("cheetah-run", 0.0002), ("hopper-hop", 0.001), ("quadruped-run", 0.001)])
-def test_table_8(task: str, rate: float) -> None:
-    env_id = f"dm_control/{task}-v0"
-    path = ZOO / "aarl_state.yml"
-    assert load_hyperparameters(path, env_id)["buffer_size"] == 100_000
-    model = build(path, env_id)
-    assert model.learning_starts == 1000
-    assert model.get_env().get_attr("num_repeats") == [4]
-    assert model.policy_kwargs["net_arch"] == [1024, 1024]
-    assert model.predictor_width == 256
-    for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer):
-        assert optimizer.param_groups[0]["lr"] == rate
-        assert tuple(optimizer.param_groups[0]["betas"]) == (0.9, 0.999)
-        assert type(optimizer) is th.optim.Adam
-    assert model.ent_coef_optimizer.param_groups[0]["lr"] == 0.0001
-    assert tuple(model.ent_coef_optimizer.param_groups[0]["betas"]) == (0.5, 0.999)
-    assert (model.batch_size, model.aux_batch_size or model.batch_size) == (512, 512)
-    assert (model.tau, model.encoder_tau, model.gamma, model.target_update_interval) == (0.01, 0.05, 0.99, 2)
-    assert model.log_ent_coef.exp().item() == pytest.approx(0.1)
-    encoder = model.critic.features_extractor
-    assert isinstance(encoder, DenseMLP) and encoder.features_dim == 40
-    assert sum(isinstance(module, th.nn.ReLU) for module in encoder.modules()) <= 1  # one dense layer
-    assert model.policy_kwargs["features_extractor_kwargs"]["n_layers"] == 1
-
-
-@pytest.mark.parametrize(("task", "repeat"), [("cheetah-run", 4), ("reacher-easy", 4), ("walker-walk", 2)])
-def test_table_7_during_evolution(task: str, repeat: int) -> None:
-    env_id = f"dm_control/{task}-v0"
-    path = ZOO / "aarl_pixel_evolution.yml"
-    assert load_hyperparameters(path, env_id)["buffer_size"] == 100_000
-    model = build(path, env_id)
-    assert model.observation_space == gym.spaces.Box(0, 255, (3 * 3, 100, 100), np.uint8)
-    assert model.policy.augmentation == "random_crop" and model.policy.crop_size == 84
-    assert model.learning_starts == 1000
-    assert model.get_env().get_attr("num_repeats") == [repeat]
-    assert model.policy_kwargs["net_arch"] == [1024, 1024]
-    assert model.predictor_width == 256
-    for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer):
-        assert optimizer.param_groups[0]["lr"] == 0.001
-        assert tuple(optimizer.param_groups[0]["betas"]) == (0.9, 0.999)
-        assert type(optimizer) is th.optim.Adam
-    assert model.ent_coef_optimizer.param_groups[0]["lr"] == 0.0001
-    assert tuple(model.ent_coef_optimizer.param_groups[0]["betas"]) == (0.5, 0.999)
-    assert (model.batch_size, model.aux_batch_size) == (128, 128)
-    assert (model.tau, model.encoder_tau, model.gamma, model.target_update_interval) == (0.01, 0.05, 0.99, 2)
-    assert model.log_ent_coef.exp().item() == pytest.approx(0.1)
-    encoder = model.critic.features_extractor
-    assert isinstance(encoder, PixelEncoder) and encoder.features_dim == 50
-    convolutions = [module for module in encoder.modules() if isinstance(module, th.nn.Conv2d)]
-    assert [convolution.out_channels for convolution in convolutions] == [32, 32, 32, 32]
 
 
 def test_the_papers_searches_are_all_there() -> None:

@@ -15,7 +15,7 @@ from search.config import SearchConfig, load_config
 from search.sampler import AuxLossSampler
 from search.space import params_to_loss, suggest_aux_loss
 
-CONFIGS = sorted(Path("zoo_configs/search").glob("*.yml"))
+CONFIGS = sorted((Path(__file__).parent.parent / "zoo_configs" / "search").glob("*.yml"))
 TINY = """\
 environment: Pendulum-v1
 hyperparameters: own.yml

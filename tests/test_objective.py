@@ -156,7 +156,8 @@ def test_the_curve_is_that_of_a_plain_training(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["curve.csv", "run.json"]
 
 
-def test_other_gymnasium_environments(tmp_path: Path) -> None:
+def test_other_gymnasium_environments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     run = train_candidate("Pendulum-v1", None, HYPER | {"env_kwargs": {"frame_stack": 2}}, 0, [30, 60], 1)
     assert [point.environment_steps for point in run.curve] == [30, 60]
     assert not list(tmp_path.iterdir())
