@@ -9,8 +9,10 @@ import pytest
 from optuna.trial import FrozenTrial, TrialState
 from optuna_dashboard._note import get_note_from_system_attrs
 from program import aarl, start
+from typer.testing import CliRunner
 
 from search import evolve, workers
+from search.cli import app
 from search.config import SearchConfig, load_config
 from search.sampler import AuxLossSampler
 from search.space import params_to_loss, suggest_aux_loss
@@ -145,9 +147,8 @@ def test_an_unknown_study_is_one_line(config: Path, tmp_path: Path) -> None:
     where = f"sqlite:///{tmp_path / 'study.db'}"
     optuna.create_study(study_name="other", storage=where)
     for name, problem in (("tiny", "no study 'tiny': the storage has other"), ("other", "no configuration")):
-        process = start("worker", "--storage", where, "--study", name, folder=tmp_path)
-        output, _ = process.communicate(timeout=60)
-        assert process.returncode == 2 and problem in output and "Traceback" not in output, output
+        result = CliRunner().invoke(app, ["worker", "--storage", where, "--study", name, "--folder", str(tmp_path)])
+        assert result.exit_code == 2 and problem in " ".join(result.output.split()), result.output
 
 
 def test_a_search_on_ray(config: Path, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
@@ -865,21 +864,6 @@ def test_loading_without_the_auxiliary_loss_says_what_is_wrong(tmp_path: pathlib
     make_model("state").save(tmp_path / "model")
     with pytest.raises(RuntimeError, match="of a model with an auxiliary loss"):
         SACAux.load(tmp_path / "model", aux_loss=None)
-
-
-def test_her_says_so_with_the_default_loss_and_trains_without() -> None:
-    env = BitFlippingEnv(n_bits=3, continuous=True)
-    with pytest.raises(ValueError, match="HerReplayBuffer cannot be used with an auxiliary loss"):
-        SACAux("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer)
-    model = SACAux(
-        "MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, aux_loss=None, learning_starts=20, batch_size=8
-    )
-    assert model.learn(40)._n_updates == 20
-
-
-def test_discrete_actions() -> None:
-    with pytest.raises(AssertionError, match="Discrete"):
-        SACAux("MlpPolicy", "CartPole-v1")
 
 
 def test_a_frame_stack_that_observations_are_not() -> None:

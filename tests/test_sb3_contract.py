@@ -521,18 +521,6 @@ def test_callbacks(tmp_path: Any) -> None:
     assert steps == list(range(1, 13))
 
 
-def test_equal_seeds_equal_runs() -> None:
-    def run(seed: int) -> SACAux:
-        env = RandomEnv(image_space(1, 40, 40))  # random crops are random numbers, too
-        kwargs: dict[str, Any] = {"policy_kwargs": {"features_extractor_kwargs": SMALL_CNN}}
-        return make_model(env, "CnnPolicy", crop_size=36, seed=seed, **kwargs).learn(20)
-
-    first = run(0)
-    assert_equal_parameters(first, run(0))
-    with pytest.raises(AssertionError):
-        assert_equal_parameters(first, run(1))
-
-
 def test_her() -> None:
     kwargs: dict[str, Any] = {"replay_buffer_class": HerReplayBuffer, "buffer_size": 200, "learning_starts": 20}
     for aux_loss in ("auto", FORWARD_DYNAMICS):

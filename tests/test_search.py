@@ -14,8 +14,10 @@ import yaml
 from optuna.trial import TrialState
 from optuna_dashboard._custom_plot_data import get_plotly_graph_objects
 from program import aarl, start
+from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss
+from search.cli import app
 from search.space import params_to_loss
 from search.storage import open_storage
 
@@ -173,7 +175,8 @@ def test_the_other_procedures_on_a_finished_search(config: Path, tmp_path: Path)
     assert best.user_attrs["variant"] in first and "1.000" in first
 
 
-def test_unusable_input_is_one_line(config: Path, tmp_path: Path) -> None:
+def test_unusable_input_is_one_line(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     aarl("search", config, "--stages", 1, folder=tmp_path)
     config.write_text(config.read_text().replace("population_size: 4", "population_size: 6"))
     (tmp_path / "runs/other").mkdir()
@@ -187,8 +190,7 @@ def test_unusable_input_is_one_line(config: Path, tmp_path: Path) -> None:
         (("search", tmp_path / "missing.yml"), "missing.yml"),
         (("search", config, "--storage", "postgresql://me:secret@127.0.0.1:1/nothing"), "me:***"),
     ):
-        process = start(*arguments, folder=tmp_path)
-        output, _ = process.communicate(timeout=60)
-        assert process.returncode == 2 and culprit in output and "Traceback" not in output and "secret" not in output, output
-        assert len(output.strip().splitlines()) <= 2, output
+        result = CliRunner(env={"COLUMNS": "200"}).invoke(app, [*map(str, arguments)])
+        assert result.exit_code == 2 and culprit in result.output and "secret" not in result.output, result.output
+        assert len(result.output.strip().splitlines()) <= 2 and "Traceback" not in result.output, result.output
     assert not (tmp_path / "elsewhere").exists()
