@@ -88,19 +88,24 @@ def main() -> None:
             if i:  # the first one warms up
                 seconds[name].append(time.perf_counter() - started)
 
-    table = Table("what is drawn", "ms", "observations a second", "times SB3's rate", "bytes a transition")
+    names = ("what is drawn", "ms", "windows a second", "observations a second", "times SB3's rate", "bytes a transition")
+    table = Table(*names)
     rows = []
     for name, values in seconds.items():
         row: dict[str, Any] = {
             "draw": name,
             "ms": 1e3 * statistics.median(values),
+            "windows_per_second": BATCH / statistics.median(values) if name.startswith("windows") else None,
             "observations_per_second": BATCH * (HORIZON + 1) / statistics.median(values),
             "times_sb3": statistics.median(base / own for own, base in zip(values, seconds["SB3"], strict=True)),
             "bytes_per_transition": bytes_each.get(name),
         }
         rows.append(row)
-        size = f"{row['bytes_per_transition']:,.0f}" if name in bytes_each else ""
-        table.add_row(name, f"{row['ms']:.2f}", f"{row['observations_per_second']:,.0f}", f"{row['times_sb3']:.2f}", size)
+        windows, size = (
+            "" if row[key] is None else f"{row[key]:,.0f}" for key in ("windows_per_second", "bytes_per_transition")
+        )
+        rate = f"{row['observations_per_second']:,.0f}"
+        table.add_row(name, f"{row['ms']:.2f}", windows, rate, f"{row['times_sb3']:.2f}", size)
     Console().print(table)
     if args.out:
         save_result(args.out, transitions=args.transitions, rows=rows)

@@ -141,7 +141,7 @@ class FrameStore:
         :param final: Where the newest frame lies aside, -1 where it does not
         :param crop_size: Height and width in pixels that each observation is cropped to, at a place of its own, uniform
             over all; the frames of a stack stay together. None for no crop
-        :return: (..., *shape), where the frames lie
+        :return: (..., *shape), height and width those of the crop, on the device that the frames lie on
         """
         back = np.arange(self.stack - 1, -1, -1)
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
@@ -364,7 +364,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :param envs: Envs
         :param following: Whether to give the next observation instead
         :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
-        :return: (..., *observation shape), on ``storage_device``
+        :return: (..., *observation shape), height and width those of the crop, on ``storage_device``
         """
         positions, envs, following = np.broadcast_arrays(positions, envs, following)
         # Positions before self.pos were written in this round of the ring, the others in the round before.

@@ -42,6 +42,7 @@ class Benchmark:
     :param seeds: Seeds of the trainings
     :param every: Environment steps after which it is also evaluated, None for at the checkpoints only
     :param evaluation_episodes: Episodes of each evaluation
+    :param name: Of the study that the runs are shared out in
     """
 
     files: Mapping[str, str]
