@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_aarl import SACAux, catalog, encoders
 from sb3_aarl.envs import env_ids, make_dmc_env
-from search.config import load_hyperparameters
+from search.config import load_hyperparameters, merge
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 
@@ -153,6 +153,15 @@ def test_rl_zoo_reads_the_same(variant: str) -> None:
 # What each file of choices/ changes, and of which variant.
 CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "aarl_state_bf16": ("aarl_state", {"precision": "bf16"}),
+    "aarl_state_bf16_joint": ("aarl_state", {"precision": "bf16", "joint_optimizer": True}),
+    "aarl_state_bf16_predictor": (
+        "aarl_state",
+        {"precision": "bf16", "predictor_width": None, "predictor_batch_norm": True},
+    ),
+    "aarl_state_bf16_separate": (
+        "aarl_state",
+        {"precision": "bf16", "policy_kwargs": {"share_features_extractor": False}},
+    ),
     "sac_dense_mlp_bf16": ("sac_dense_mlp", {"precision": "bf16"}),
 }
 
@@ -162,7 +171,7 @@ def test_choices_differ_in_nothing_else() -> None:
     for choice, (variant, changes) in CHOICES.items():
         path = ZOO / "choices" / f"{choice}.yml"
         for env_id in {*yaml.safe_load(path.read_text()), "dm_control/walker-walk-v0"} - {"default"}:
-            assert load_hyperparameters(path, env_id) == {**load_hyperparameters(ZOO / f"{variant}.yml", env_id), **changes}
+            assert load_hyperparameters(path, env_id) == merge(load_hyperparameters(ZOO / f"{variant}.yml", env_id), changes)
 
 
 # All text that there is but environments and files; RL-Zoo would take any other for text too.
