@@ -10,17 +10,19 @@ import shlex
 import statistics
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from sb3_aarl.callbacks import read_curve
 from search.benchmark import read_abouts, task_name
+from search.table import closest_table, paper_scores
 
 RESULTS = Path(__file__).parent
 ABOUT = "about.md"
 # The paper's search from states (appendix A.4): candidates, environment steps of each, and the GPU hours it took.
 CANDIDATES, STEPS, PAPER_HOURS = 700, 500_000, 1_500
+STATE_TABLE = 4
 
 INTRODUCTION = f"""# Results
 
@@ -66,6 +68,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
     yield printed_table(folder)
     yield "```\n"
     abouts = read_abouts(folder)[0]
+    yield from paper(abouts.values())
     finished = [(path, about) for path, about in abouts.items() if "seconds" in about]
     yield "| run | return | AULC | minutes | threads | processor | commit | date |"
     yield "|---|---|---|---|---|---|---|---|"
@@ -102,6 +105,23 @@ def printed_table(folder: Path) -> str:
         program, env=environment, cwd=RESULTS.parent, text=True, stdout=subprocess.PIPE, check=True
     ).stdout
     return "\n".join(line.rstrip() for line in printed.strip().splitlines())
+
+
+def paper(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
+    """
+    What the paper has on the same tasks at the same steps, where no variant is one of its own (else it is in the table).
+
+    :param abouts: What stands beside the curves
+    """
+    if closest_table(about["variant"] for about in abouts) is not None:
+        return
+    asked_for = dict.fromkeys((step, about["environment"]) for about in abouts for step in about["checkpoints"])
+    for step, environment in asked_for:
+        scores = paper_scores(STATE_TABLE).query("checkpoint == @step and environment == @environment")
+        cells = [f"{row.column} {row.mean:.0f} ± {row.std:.0f}" for row in scores.itertuples()]
+        if cells:
+            runs = scores["runs"].iloc[0]
+            yield f"The paper's table {STATE_TABLE}, {task_name(environment)} at {step:,}, {runs} runs: {', '.join(cells)}.\n"
 
 
 def command(about: dict[str, Any]) -> str:

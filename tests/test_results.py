@@ -51,6 +51,10 @@ def test_readme_of_planted_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         runs[path] = {**grid.about(cell), "sessions": [SESSION], "seconds": seconds}
         (path / ABOUT).write_text(json.dumps(runs[path]))
     (folder / "about.md").write_text("Planted\nWhat is said.\n")
+    about = grid.about(grid.cells[0])
+    (line,) = make_readme["paper"]([{**about, "variant": "of_nobody"}])
+    assert "cheetah-run at 100,000, 10 runs: AARL-State 472 ± 30" in line
+    assert not list(make_readme["paper"]([about]))  # it is in the table
 
     text = make_readme["readme"](tmp_path / "results")
     assert "## Planted\n\nWhat is said.\n" in text
