@@ -73,7 +73,8 @@ def test_readme_of_planted_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = make_readme["readme"](RESULTS)
     assert (RESULTS / "README.md").read_text(encoding="utf-8") == text, "python results/make_readme.py"
-    again = [about for command in commands(text) for about in asked_for(tmp_path, command, monkeypatch)]
+    asked = [about for command in commands(text) for about in asked_for(tmp_path, command, monkeypatch)]
+    again = json.loads(json.dumps(asked))  # tuples are lists there
     for folder in make_readme["folders"](RESULTS):
         abouts, unreadable = read_abouts(folder)
         assert not unreadable
