@@ -22,7 +22,8 @@ RESULTS = Path(__file__).parent
 ABOUT = "about.md"
 # The paper's search from states (appendix A.4): candidates, environment steps of each, and the GPU hours it took.
 CANDIDATES, STEPS, PAPER_HOURS = 700, 500_000, 1_500
-STATE_TABLE = 4
+# The paper's scores from pixels and from states.
+TABLES = {"CnnPolicy": 3, "MlpPolicy": 4}
 
 INTRODUCTION = f"""# Results
 
@@ -115,13 +116,18 @@ def paper(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
     """
     if closest_table(about["variant"] for about in abouts) is not None:
         return
-    asked_for = dict.fromkeys((step, about["environment"]) for about in abouts for step in about["checkpoints"])
-    for step, environment in asked_for:
-        scores = paper_scores(STATE_TABLE).query("checkpoint == @step and environment == @environment")
+    asked_for = [
+        (TABLES[about["hyperparameters"]["policy"]], step, about["environment"])
+        for about in abouts
+        for step in about["checkpoints"]
+        if about["hyperparameters"]["policy"] in TABLES
+    ]
+    for number, step, environment in dict.fromkeys(asked_for):
+        scores = paper_scores(number).query("checkpoint == @step and environment == @environment")
         cells = [f"{row.column} {row.mean:.0f} ± {row.std:.0f}" for row in scores.itertuples()]
         if cells:
             runs = scores["runs"].iloc[0]
-            yield f"The paper's table {STATE_TABLE}, {task_name(environment)} at {step:,}, {runs} runs: {', '.join(cells)}.\n"
+            yield f"The paper's table {number}, {task_name(environment)} at {step:,}, {runs} runs: {', '.join(cells)}.\n"
 
 
 def command(about: dict[str, Any]) -> str:

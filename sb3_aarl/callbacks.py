@@ -2,8 +2,8 @@
 
 import csv
 import io
-import os
 import time
+import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -195,9 +195,12 @@ def replace_text(path: Path, text: str) -> None:
     :param text: What will be in it, line ends as they are
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    unfinished.write_text(text, encoding="utf-8", newline="")
-    unfinished.replace(path)
+    unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        unfinished.write_text(text, encoding="utf-8", newline="")
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)  # half of it may be what fills the disk
 
 
 def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:

@@ -114,6 +114,18 @@ class _FewRows(th.autograd.Function):
         return of_inputs, None, None
 
 
+def _is_plain(network: nn.Module) -> bool:
+    """Whether a network is what SB3 made it, one layer after the other: not compiled, no hooks, no layers of another kind."""
+    return (
+        type(network) is nn.Sequential
+        and not any(
+            module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
+            for module in network.modules()
+        )
+        and all(type(module) is nn.Linear for module in network.modules() if isinstance(module, nn.Linear))
+    )
+
+
 class Trunk(NamedTuple):
     """
     Stands for observations whose encoding is known up to the projection, so that actor and critic need not do it twice.
@@ -248,13 +260,12 @@ class Critic(_CropsImages, ContinuousCritic):
             a GPU would wait to know which rows, and does not do it
         :return: (batch, 1)
         """
-        if not skip_rows or latent.device.type != "cpu":
+        if not skip_rows or latent.device.type != "cpu" or not all(map(_is_plain, self.q_networks)):
             return th.cat(self.q_values(latent, actions), dim=1).min(dim=1, keepdim=True).values
         values = []
         for q_network in self.q_networks:
             x = th.cat([latent, actions], dim=1)
-            assert isinstance(q_network, nn.Sequential)
-            for layer in q_network:
+            for layer in q_network.children():
                 x = _FewRows.apply(x, layer.weight, layer.bias) if isinstance(layer, nn.Linear) else layer(x)
             values.append(full_precision(x))
         return th.cat(values, dim=1).min(dim=1, keepdim=True).values

@@ -150,7 +150,7 @@ class Benchmark:
             of_now = list(self.checkpoints.get(environment, ()))
             # Written only where it differs: a worker of another program may be adding to it.
             if of_now not in ([], about.get("checkpoints")) and about.get("evaluations") == self.evaluations(environment):
-                _write_about(path, {**about, "checkpoints": of_now})
+                _write_about(path, {**_read_about(path), "checkpoints": of_now})
 
 
 def load_benchmark(

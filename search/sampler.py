@@ -312,8 +312,8 @@ class AuxLossSampler(BaseGASampler):
         """Give the trial a place. Waits for one where there is none, and for trials before it that still choose."""
         self._raise_error_if_multi_objective(study)
         try:
-            if self.worker is not None:
-                worker = workers.identity() if self.worker == "auto" else self.worker
+            worker = workers.identity() if self.worker == "auto" else self.worker
+            if worker != trial.user_attrs.get(workers.WORKER_KEY):  # a heartbeat's copy has the name of the dead
                 _show(study, trial, workers.WORKER_KEY, worker)
             self._find_place(study, trial)
         except BaseException:
@@ -356,7 +356,8 @@ class AuxLossSampler(BaseGASampler):
 
     def after_trial(self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None) -> None:
         """Mark a candidate that failed in a live worker, or was pruned as invalid: its place gets another one."""
-        error = None if (frame := _in_optimize()) is None else frame.f_locals.get("func_err")
+        frame = _in_optimize(study, trial)
+        error = None if frame is None else frame.f_locals["func_err"]
         if isinstance(error, KeyboardInterrupt):
             study._storage.set_trial_user_attr(trial._trial_id, "interrupted", True)
             return
@@ -418,7 +419,7 @@ class AuxLossSampler(BaseGASampler):
 
     def _find_place(self, study: Study, trial: FrozenTrial) -> None:
         # Signs of life from the beginning on, where study.optimize will go on with them.
-        wait = _Wait(study, trial, beats=_in_optimize() is not None)
+        wait = _Wait(study, trial, beats=_in_optimize(study, None) is not None)
         while True:
             with self._lock:
                 self._refresh(study)
@@ -440,7 +441,8 @@ class AuxLossSampler(BaseGASampler):
             if free is not None:  # two chose the same one, and both gave way
                 time.sleep(np.random.default_rng().uniform(0.0, 0.1))  # SB3 seeds the generators of the process
                 continue
-            workers.fail_dead(study, running)
+            wait.beat()
+            workers.fail_dead(study, running, but=trial)
             wait.pause(ahead, running)
 
     def _nth_free(self, study: Study, n: int, enqueued: bool = False) -> tuple[int, int] | None:
@@ -536,15 +538,23 @@ class AuxLossSampler(BaseGASampler):
         return sorted(population, key=rank)[: max(1, round(self.parents * len(population)))]
 
 
-def _in_optimize() -> FrameType | None:
+def _in_optimize(study: Study, trial: FrozenTrial | None) -> FrameType | None:
     """
-    The frame in which ``study.optimize`` runs the trial that it asks for or tells of, None outside of it. Optuna does not tell
-    a sampler why a trial failed.
+    The frame in which ``study.optimize`` tells of a trial, or asks for one; None where somebody else does. Optuna does not
+    tell a sampler who asks, nor why a trial failed.
+
+    :param study: The study
+    :param trial: The trial that it tells of, None if it asks
     """
     frame = inspect.currentframe()
     while frame is not None and frame.f_code is not _run_trial.__code__:
         frame = frame.f_back
-    return frame
+    if frame is None:
+        return None
+    # An objective may ask for trials too, of this study or of another one.
+    of, its = frame.f_locals["study"], frame.f_locals.get("trial")
+    is_same = of._storage is study._storage and of._study_id == study._study_id
+    return frame if is_same and (None if its is None else its._trial_id) == (trial and trial._trial_id) else None
 
 
 def _show(study: Study, trial: FrozenTrial, key: str, value: Any) -> None:
@@ -576,7 +586,7 @@ class _Wait:
 
     def beat(self) -> None:
         """Give a sign of life, where it is time for one."""
-        if time.monotonic() - self.beaten >= self.beat_every:
+        if self.beat_every < math.inf and time.monotonic() - self.beaten >= self.beat_every:
             self.beaten = time.monotonic()
             workers.beat(self.study._storage, self.trial._trial_id)
 
@@ -585,7 +595,6 @@ class _Wait:
         :param ahead: Trials that have to choose a place before
         :param running: Trials whose places may become free, or whose stage may end
         """
-        self.beat()
         now = time.monotonic()
         queue = [other.number for other in ahead]
         if queue != self.queue:  # it moves: the turn of this trial may be near

@@ -114,8 +114,9 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
         if searched != value:
             raise ValueError(f"the sampler searches with {name}={searched!r}, suggest_aux_loss asks for {name}={value!r}")
     horizon = trial.suggest_int("horizon", 1, max_horizon)
-    if not 1 <= horizon <= max_horizon:  # Optuna only warns of an enqueued one
-        raise optuna.TrialPruned(f"horizon must be between 1 and {max_horizon}, not {horizon}")
+    longest = min(max_horizon, getattr(sampler, "max_horizon", max_horizon))
+    if not 1 <= horizon <= longest:  # Optuna only warns of an enqueued one
+        raise optuna.TrialPruned(f"horizon must be between 1 and {longest}, not {horizon}")
     params: dict[str, Any] = {"horizon": horizon}
     for name, distribution in distributions(horizon, max_horizon, operators).items():
         if isinstance(distribution, CategoricalDistribution):

@@ -98,17 +98,21 @@ def beat(storage: BaseStorage, trial_id: int) -> None:
         storage.record_heartbeat(trial_id)  # type: ignore[attr-defined]
 
 
-def fail_dead(study: Study, trials: Iterable[FrozenTrial], all_have_names: bool = False) -> int:
+def fail_dead(
+    study: Study, trials: Iterable[FrozenTrial], all_have_names: bool = False, but: FrozenTrial | None = None
+) -> int:
     """
     Fail the running trials whose worker is gone, so that their places are given out again.
 
     Of this machine it is known at once which workers have died. Of all machines, and of workers that were stopped, it is
     known by the signs of life of their trials, where the storage keeps them and this process keeps looking: more often
-    than once a heartbeat interval, for about two of them (see :class:`search.storage.WithHeartbeat`).
+    than once a heartbeat interval, for about two of them (see :class:`search.storage.WithHeartbeat`). No callback of the
+    storage makes a copy of them: who looks waits for a place itself, and could not take the copy's.
 
     :param study: The study
     :param trials: Trials to look at; those without a sign of life are failed whether they are among these or not
     :param all_have_names: Whether all workers of the study give their names, so that one without has died
+    :param but: Not this one: the caller's own, which is alive however long its program has slept
     :return: How many were failed
     """
     failed = 0
@@ -128,5 +132,6 @@ def fail_dead(study: Study, trials: Iterable[FrozenTrial], all_have_names: bool 
     if is_heartbeat_enabled(storage):
         reason = f"no sign of life from its worker for {2 * storage.get_heartbeat_interval()} seconds"
         for trial_id in storage._get_stale_trial_ids(study._study_id):
-            failed += fail(study, storage.get_trial(trial_id), reason)
+            if but is None or trial_id != but._trial_id:
+                failed += fail(study, storage.get_trial(trial_id), reason)
     return failed

@@ -439,8 +439,9 @@ def test_a_program_that_ends_in_its_objective_goes_on_with_the_same_candidate(er
     for _ in range(5):
         with pytest.raises(type(error)):
             study.optimize(ends, catch=(DivergedError,))
-    assert sum(trial.state == TrialState.FAIL for trial in study.trials) == 5 + sum(key[2] > 0 for key in issued(run(study)))
+    assert [trial.state == TrialState.FAIL for trial in study.trials].count(True) == 5
     undisturbed = run(make_study())
+    run(study)
     assert issued(study) == issued(undisturbed) and filled_places(study) == filled_places(undisturbed)
 
 
@@ -458,6 +459,29 @@ def test_the_objective_sees_stage_operation_and_parents() -> None:
     for number, attributes in seen.items():
         assert attributes == study.trials[number].user_attrs and attributes.keys() - {"replaces"} == keys
     assert any(attributes["parents"] for attributes in seen.values())
+
+
+@pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
+def test_only_what_study_optimize_goes_on_with_has_a_heart(tmp_path: Path) -> None:
+    storage = RDBStorage(f"sqlite:///{tmp_path}/study.db", heartbeat_interval=60)
+    beaten: list[int] = []
+    record = storage.record_heartbeat
+    storage.record_heartbeat = lambda trial_id: (beaten.append(trial_id), record(trial_id))  # type: ignore[method-assign]
+    study = make_study(storage=storage)
+    study.ask()  # told by whoever asked
+    assert beaten == []
+
+    def objective(trial: optuna.Trial) -> float:
+        assert set(beaten) == {trial._trial_id}
+        other = study.ask()  # a batch
+        assert study.trials[other.number].state == TrialState.RUNNING and set(beaten) == {trial._trial_id}
+        study.tell(other, state=TrialState.FAIL)
+        return score(suggest_aux_loss(trial, 2))
+
+    study.optimize(objective, n_trials=1)
+    asked_outside, mine, other = study.trials
+    assert PLACE_KEY in other.system_attrs and module.REJECTED_KEY in other.system_attrs
+    assert mine.state == TrialState.COMPLETE and asked_outside.state == TrialState.RUNNING
 
 
 @pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")

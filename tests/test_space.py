@@ -213,3 +213,6 @@ def test_a_space_other_than_the_sampler_s_is_refused(settings: dict[str, Any], m
         loss = suggest_aux_loss(trial, max_horizon, ["mse", "inner"])
         assert str(loss) == study.trials[trial.number].system_attrs[PLACE_KEY]["loss"]
         study.tell(trial, 0.0)
+    study.enqueue_trial({"horizon": 3})  # it would become a parent, of another space
+    with pytest.raises(optuna.TrialPruned, match="between 1 and 2, not 3"):
+        suggest_aux_loss(study.ask(), 3, ["mse", "inner"])

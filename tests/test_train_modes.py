@@ -127,6 +127,27 @@ def test_the_actor_loss_leaves_out_critics_that_are_not_the_smallest(n_critics: 
     assert all(parameter.grad is None for parameter in model.critic.parameters())
 
 
+def test_networks_that_a_user_changed_are_called_as_they_are() -> None:
+    for change in ("hook", "norm", "layer"):
+        critic = filled_model().critic
+        latent, actions = th.randn(8, critic.features_extractor.features_dim), th.rand(8, 2)
+        actions = actions[:, : critic.q_networks[0][0].in_features - latent.shape[1]]
+        before = critic.min_q_values(latent, actions, True)
+        first = critic.q_networks[0]
+        if change == "hook":
+            first[0].register_forward_hook(lambda module, inputs, output: output + 1)
+        elif change == "norm":
+            th.nn.utils.parametrizations.spectral_norm(first[0])
+        else:
+            first[0] = type("Doubled", (th.nn.Linear,), {"forward": lambda self, x: 2 * x @ self.weight.T})(
+                first[0].in_features, first[0].out_features
+            )
+        th.manual_seed(0)
+        least = th.cat(critic.q_values(latent, actions), dim=1).amin(dim=1, keepdim=True)
+        assert_same(critic.min_q_values(latent, actions, True).detach(), least.detach())
+        assert not th.equal(before, least)
+
+
 @pytest.mark.parametrize("given", [{}, {"foreach": True}, {"fused": False}, {"eps": 1e-3}], ids=str)
 def test_adam_is_fused_unless_the_user_says_how(given: dict[str, Any]) -> None:
     model = make_model(policy_kwargs={"optimizer_kwargs": given})
