@@ -4,6 +4,7 @@ import json
 import re
 import runpy
 import shlex
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -83,3 +84,14 @@ def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             kept = {key: value for key, value in {**about, "sessions": []}.items() if key != "seconds"}
             assert kept in again
             assert [point.environment_steps for point in read_curve(path / "curve.csv")] == about["evaluations"]
+
+
+def test_the_figures_of_the_first_readme() -> None:
+    readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
+    said = []
+    for variant in ("aarl_state_bf16", "sac_dense_mlp_bf16"):
+        curves = sorted((RESULTS / "choices" / variant / "cheetah-run").glob("seed-*/curve.csv"))
+        returns = [read_curve(curve)[-1].mean for curve in curves]
+        said.append(f"{statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f}")
+        assert f"{len(returns)} seeds" in readme
+    assert " against ".join(said) in readme
