@@ -106,15 +106,15 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
     check_operators(operators)
     # Optuna would draw anew what does not fit, and train another loss than the sampler took note of.
     sampler = getattr(getattr(trial, "study", None), "sampler", None)
+    longest = getattr(sampler, "max_horizon", max_horizon)
     given = None if operators is None else tuple(operators)
     for name, value, searched in (
-        ("max_horizon", max_horizon, max(max_horizon, getattr(sampler, "max_horizon", 0))),
+        ("max_horizon", max_horizon, max(max_horizon, longest)),
         ("operators", given, getattr(sampler, "operators", given)),
     ):
         if searched != value:
             raise ValueError(f"the sampler searches with {name}={searched!r}, suggest_aux_loss asks for {name}={value!r}")
     horizon = trial.suggest_int("horizon", 1, max_horizon)
-    longest = min(max_horizon, getattr(sampler, "max_horizon", max_horizon))
     if not 1 <= horizon <= longest:  # Optuna only warns of an enqueued one
         raise optuna.TrialPruned(f"horizon must be between 1 and {longest}, not {horizon}")
     params: dict[str, Any] = {"horizon": horizon}
