@@ -19,9 +19,11 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.sac.policies import SACPolicy
+from torch.optim import Adam
 
 from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import LONGEST_HORIZON, AuxLoss
+from sb3_aarl.buffers import WindowReplayBuffer
 from sb3_aarl.encoders import encoder_class
 from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env, wrap_env
 from sb3_aarl.policies import SACAuxPolicy
@@ -390,7 +392,8 @@ def _size(value: Any, known: dict[int, float]) -> float:
 
 def _unknown(key: str, known: Iterable[str]) -> str:
     key = key[:100]
-    return f"unknown key {key!r}, nearest known key: {difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]!r}"
+    nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
+    return f"unknown key {key!r}, {f'nearest known key: {nearest[0]!r}' if nearest else 'there are none here'}"
 
 
 def _mapping(values: Any, hints: Mapping[str, Any], where: str, folder: Path) -> dict[str, Any]:
@@ -479,6 +482,21 @@ _POLICY_ARGUMENTS = _arguments(
     SACAuxPolicy,
     without=("observation_space", "action_space", "lr_schedule", "use_sde", "augmentation", "crop_size"),
 )
+# Without what SACAux sets itself.
+_BUFFER_ARGUMENTS = _arguments(
+    WindowReplayBuffer,
+    without=(
+        "buffer_size",
+        "observation_space",
+        "action_space",
+        "device",
+        "n_envs",
+        "optimize_memory_usage",
+        "n_steps",
+        "gamma",
+    ),
+)
+_OPTIMIZER_ARGUMENTS = _arguments(Adam, without=("params", "lr"))
 _ARGUMENTS = {
     **_arguments(SACAux, without=("env", "seed", "action_noise", "replay_buffer_class", "_init_setup_model")),
     "policy": str,
@@ -490,14 +508,15 @@ _ARGUMENTS = {
 
 
 def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str) -> dict[str, Any]:
+    def check(mapping: dict[str, Any], key: str, hints: Mapping[str, Any], within: str = "") -> None:
+        if mapping.get(key) is not None:
+            mapping[key] = _mapping(mapping[key], hints, f"{where}: {within}{key}", Path())
+
     checked = _mapping(dict(values), _ARGUMENTS, where, Path())
     make = make_dmc_env if env_id.startswith(PREFIX) else wrap_env
-    for key, hints in (
-        ("env_kwargs", _arguments(make, without=("env_id", "env", "seed"))),
-        ("policy_kwargs", _POLICY_ARGUMENTS),
-    ):
-        if checked.get(key) is not None:
-            checked[key] = _mapping(checked[key], hints, f"{where}: {key}", Path())
+    check(checked, "env_kwargs", _arguments(make, without=("env_id", "env", "seed")))
+    check(checked, "replay_buffer_kwargs", _BUFFER_ARGUMENTS)
+    check(checked, "policy_kwargs", _POLICY_ARGUMENTS)
     if checked.get("aux_loss") not in (None, "auto"):
         _convert(values["aux_loss"], AuxLoss, f"{where}: aux_loss", Path())
         checked["aux_loss"] = None if values["aux_loss"] == "none" else values["aux_loss"]
@@ -507,10 +526,16 @@ def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str)
     ):
         if number is not None and number < 1:
             raise ConfigError(f"{where}: {key} must be at least 1, not {number}")
+    policy_kwargs = checked.get("policy_kwargs") or {}
+    pixels = (checked.get("env_kwargs") or {}).get("pixels", False)
+    policy = SACAux.policy_aliases.get(checked.get("policy", "CnnPolicy" if pixels else "MlpPolicy"), SACAuxPolicy)
+    assert issubclass(policy, SACAuxPolicy)
     try:
-        encoder_class((checked.get("policy_kwargs") or {}).get("features_extractor_class", "identity"))
+        encoder = encoder_class(policy_kwargs.get("features_extractor_class") or policy.default_encoder)
     except ValueError as error:
         raise ConfigError(f"{where}: policy_kwargs: {error}") from None
+    check(policy_kwargs, "features_extractor_kwargs", _arguments(encoder, without=("observation_space",)), "policy_kwargs.")
+    check(policy_kwargs, "optimizer_kwargs", _OPTIMIZER_ARGUMENTS, "policy_kwargs.")
     if checked.get("vec_env", "dummy") not in VEC_ENVS:
         raise ConfigError(f"{where}: vec_env must be one of {', '.join(VEC_ENVS)}, not {checked['vec_env']!r}")
     return checked
@@ -549,6 +574,10 @@ def _check(config: SearchConfig, where: str) -> None:
     environments: dict[str, tuple[str, ...]] = {"environment": (config.environment,)}
     environments |= {f"{name}.environments": part.environments for name, part in parts.items() if part}
     if config.cross_validation:
+        trained = list(dict.fromkeys(env_id for names in environments.values() for env_id in names))
+        for env_id in config.cross_validation.checkpoints:
+            nearest = difflib.get_close_matches(env_id, trained, n=1, cutoff=0.0)
+            check(env_id in trained, f"cross_validation.checkpoints: {env_id!r} is not trained on, nearest: {nearest[0]!r}")
         environments["cross_validation.checkpoints"] = tuple(config.cross_validation.checkpoints)
     for key, env_ids_ in environments.items():
         check(bool(env_ids_) or key.endswith("checkpoints"), f"{key} must name at least one environment")

@@ -184,6 +184,25 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"overrides": {"bach_size": 3}}, "overrides.*'bach_size'.*'batch_size'"),
     ({"overrides": {"env_kwargs": {"action_repeats": 2}}}, "env_kwargs.*'action_repeats'.*'action_repeat'"),
     ({"overrides": {"policy_kwargs": {"net_arc": [2]}}}, "policy_kwargs.*'net_arc'.*'net_arch'"),
+    ({"overrides": {"replay_buffer_kwargs": {"storage_devise": "cpu"}}}, "replay_buffer_kwargs.*'storage_device'"),
+    ({"overrides": {"replay_buffer_kwargs": {"n_envs": 2}}}, "replay_buffer_kwargs.*unknown key 'n_envs'"),
+    (
+        {"overrides": {"policy_kwargs": {"optimizer_kwargs": {"epss": 1e-5}}}},
+        r"kwargs\.optimizer_kwargs.*'epss'.*'eps'",
+    ),
+    ({"overrides": {"policy_kwargs": {"optimizer_kwargs": {"eps": "small"}}}}, "optimizer_kwargs.*eps must be a number"),
+    (
+        {"overrides": {"policy_kwargs": {"features_extractor_kwargs": {"n_layer": 2}}}},
+        r"policy_kwargs\.features_extractor_kwargs: unknown key 'n_layer', nearest known key: 'n_layers'",
+    ),
+    (
+        {"overrides": {"policy_kwargs": {"features_extractor_class": "mlp", "features_extractor_kwargs": {"n_filters": 2}}}},
+        "features_extractor_kwargs: unknown key 'n_filters'",
+    ),
+    (
+        {"overrides": {"policy_kwargs": {"features_extractor_class": "identity", "features_extractor_kwargs": {"width": 2}}}},
+        "unknown key 'width', there are none here",
+    ),
     ({"overrides": {"batch_size": "many"}}, "batch_size must be an integer, not 'many'"),
     ({"overrides": {"learning_rate": "lin_1e-3"}}, "learning_rate must be a number, not 'lin_1e-3'"),
     ({"overrides": {"aux_loss": "no-such-loss"}}, "no-such-loss"),
@@ -225,6 +244,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"cross_validation": {"environments": []}}, "cross_validation.environments"),
     ({"cross_validation": {"environments": ["Pendulum"]}}, "cross_validation.environments.*Pendulum-v1"),
     ({"cross_validation": {"environments": ["Pendulum-v1"], "checkpoints": {"Pendulum-v1": [3]}}}, "multiples of Pendulum"),
+    (
+        {"cross_validation": {"environments": ["Pendulum-v1"], "checkpoints": {"MountainCarContinuous-v0": [5]}}},
+        "checkpoints: 'MountainCarContinuous-v0' is not trained on",
+    ),
 ]
 
 
