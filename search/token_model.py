@@ -7,6 +7,9 @@ from sklearn.linear_model import BayesianRidge
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
+# Of a score: such as -sys.float_info.max, which stands for a failure.
+LARGEST = 1e100
+
 
 def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
     """
@@ -54,9 +57,9 @@ class TokenModel:
         Add finished trials and fit again.
 
         :param losses: Their losses
-        :param values: Their scores, higher is better; those that are not finite are passed over
+        :param values: Their scores, higher is better; those that are not finite, or too large to be squared, are passed over
         """
-        finite = np.isfinite(values)
+        finite = np.abs(values) < LARGEST
         if not finite.any():
             return
         rows = np.column_stack([features(losses, self.max_horizon), values])[finite]

@@ -1,5 +1,7 @@
 """The model that screens offspring, against scikit-learn's on the raw rows."""
 
+import sys
+
 import numpy as np
 import pytest
 from sklearn.linear_model import BayesianRidge
@@ -66,11 +68,11 @@ def test_the_unit_of_the_scores_does_not_matter(factor: float, offset: float) ->
     np.testing.assert_allclose(model.root, other.root, rtol=0, atol=1e-6)
 
 
-def test_scores_that_are_not_finite_are_passed_over() -> None:
+def test_scores_that_are_not_finite_or_cannot_be_squared_are_passed_over() -> None:
     losses, scores = trials(50)
     model, other = TokenModel(10), TokenModel(10)
     model.add(losses[:40], list(scores[:40]))
-    other.add(losses, [*scores[:40], *[np.nan, np.inf, -np.inf] * 3, np.nan])
+    other.add(losses, [*scores[:40], *[np.nan, np.inf, -sys.float_info.max] * 3, np.nan])
     other.add(losses[:1], [np.inf])
     assert other.n_trials == 40
     np.testing.assert_array_equal(model.mean, other.mean)
