@@ -18,7 +18,7 @@ from optuna.exceptions import StorageInternalError
 
 from search.storage import root_cause, without_password
 
-# Deaths of workers without a trial finished in between, after which the pool gives up.
+# Deaths of workers in one place, without a trial finished in between, after which the pool gives up.
 MAX_DEATHS = 5
 # Seconds after which a worker that still runs is interrupted again: an exception that falls into a destructor is lost.
 INTERRUPT_SECONDS = 8.0
@@ -57,7 +57,7 @@ def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, 
     try:
         target(*arguments)
     except KeyboardInterrupt:
-        os._exit(128 + signal.SIGINT)
+        os._exit(128 + _interrupted.get("signal", signal.SIGINT))
     except Exception as error:
         errors.put(message(error))
         os._exit(1)
@@ -76,7 +76,7 @@ def message(error: BaseException) -> str:
     return without_password("".join(traceback.format_exception(error)))
 
 
-_interrupted: dict[str, float] = {}
+_interrupted: dict[str, Any] = {}  # by which signal first, and when last
 
 
 def _interrupt_once(signum: int, frame: Any) -> None:
@@ -85,6 +85,7 @@ def _interrupt_once(signum: int, frame: Any) -> None:
     if now - _interrupted.get("at", -INTERRUPT_SECONDS) < INTERRUPT_SECONDS / 2:
         return
     _interrupted["at"] = now
+    _interrupted.setdefault("signal", signum)
     if not _shielded:
         raise KeyboardInterrupt
     _shielded[-1] = True
@@ -95,7 +96,7 @@ def _interrupt_again(unraisable: Any) -> None:
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
         return
-    _interrupted.clear()
+    _interrupted.pop("at", None)
     threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
 
 
@@ -125,8 +126,9 @@ class WorkerPool:
     """
     Some processes that run one function until it returns.
 
-    A worker that is killed is started again; one that raises stops the pool. Leaving the ``with`` block interrupts
-    those that still run, as Ctrl-C does, so that they can put away what they have.
+    A worker that is killed, politely or not, is started again; one that raises stops the pool, and one that gets Ctrl-C,
+    which all get. Leaving the ``with`` block interrupts those that still run, as Ctrl-C does, so that they can put away
+    what they have.
 
     :param target: Function that each worker runs; it returns when nothing is left to do
     :param arguments: Its arguments, which must be picklable
@@ -144,7 +146,7 @@ class WorkerPool:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._start = (target, arguments, self._errors, threads or max(1, cores // n_workers))
         self.processes: list[BaseProcess] = []
-        self.deaths = 0
+        self._deaths: dict[BaseProcess, int] = {}  # of those before it in its place
         self._gpus = visible_gpus()
         self._gpu_of: dict[BaseProcess, str] = {}
         self._n_workers = n_workers
@@ -154,7 +156,7 @@ class WorkerPool:
             self._add()
         return self
 
-    def _add(self) -> None:
+    def _add(self, deaths: int = 0) -> None:
         # Two threads of BLAS or OpenMP for each of two workers on two cores are four: slower than one each.
         variables = {"OMP_NUM_THREADS": str(self._start[-1]), "MKL_NUM_THREADS": str(self._start[-1])}
         if len(self._gpus) > 1:
@@ -164,6 +166,7 @@ class WorkerPool:
             process = self._context.Process(target=_work, args=(*self._start, os.getpid()))
             process.start()
         self.processes.append(process)
+        self._deaths[process] = deaths
         self._gpu_of[process] = variables.get("CUDA_VISIBLE_DEVICES", "")
 
     def check(self, progressed: bool) -> bool:
@@ -174,21 +177,23 @@ class WorkerPool:
         :return: Whether any worker still runs
         :raises WorkerError: when a worker stopped with an error, or they keep dying
         """
-        self.deaths = 0 if progressed else self.deaths
+        if progressed:
+            self._deaths = dict.fromkeys(self._deaths, 0)
         for process in list(self.processes):
             if process.exitcode is None:
                 continue
             self.processes.remove(process)
             self._gpu_of.pop(process)
+            # Counted for each place: what kills all at once says nothing about them.
+            deaths = self._deaths.pop(process) + 1
             if not self._errors.empty():
                 raise WorkerError(self._errors.get())
             if process.exitcode == 128 + signal.SIGINT:
                 raise KeyboardInterrupt
             if process.exitcode != 0:
-                self.deaths += 1
-                if self.deaths > MAX_DEATHS:
-                    raise WorkerError(f"{self.deaths} workers died one after the other (exit code {process.exitcode})")
-                self._add()
+                if deaths > MAX_DEATHS:
+                    raise WorkerError(f"{deaths} workers died one after the other (exit code {process.exitcode})")
+                self._add(deaths)
         return bool(self.processes)
 
     def __exit__(self, *exception: Any) -> None:

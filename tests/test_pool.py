@@ -14,6 +14,7 @@ import pytest
 import torch as th
 from optuna.exceptions import StorageInternalError
 
+from search import pool as pool_module
 from search.pool import WorkerError, WorkerPool
 
 
@@ -182,3 +183,41 @@ def test_workers_of_a_program_that_was_killed_at_once_end_too(tmp_path: Path) ->
     while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline
         time.sleep(0.1)
+
+
+def wait_for_the_end(folder: Path) -> None:
+    """A worker that counts how often it was started."""
+    (folder / str(os.getpid())).touch()
+    while not (folder / "done").exists():
+        time.sleep(0.01)
+
+
+def test_workers_that_are_killed_all_at_once_are_all_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool_module, "MAX_DEATHS", 1)
+    with WorkerPool(wait_for_the_end, (tmp_path,), n_workers=3, threads=1) as pool:
+        before = list(pool.processes)
+        for number, process in enumerate(before):
+            wait_for(tmp_path / str(process.pid))
+            assert process.pid is not None
+            os.kill(process.pid, signal.SIGTERM if number else signal.SIGKILL)  # one is asked politely
+        for process in before:
+            process.join()
+        assert pool.check(progressed=False)
+        assert len(pool.processes) == 3 and not set(before) & set(pool.processes)
+        # Two deaths in one place, without a trial in between, are too many.
+        pool.processes[0].kill()
+        pool.processes[0].join()
+        with pytest.raises(WorkerError, match="2 workers died one after the other"):
+            pool.check(progressed=False)
+        (tmp_path / "done").touch()
+
+
+def test_a_finished_trial_forgets_deaths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool_module, "MAX_DEATHS", 1)
+    with WorkerPool(wait_for_the_end, (tmp_path,), n_workers=1, threads=1) as pool:
+        for _ in range(3):
+            (process,) = pool.processes
+            process.kill()
+            process.join()
+            assert pool.check(progressed=True)
+        (tmp_path / "done").touch()
