@@ -65,7 +65,8 @@ def user_key() -> bytes | None:
     The user's secret key, made when it is first asked for.
 
     :return: 32 random bytes. None, with one warning in each process, where the file can be neither read nor made, or others
-        could read it: no checkpoints are kept then, and trainings that are killed begin anew
+        could read it: no checkpoints are kept then, trainings that are killed begin anew, and those that have one already are
+        refused
     """
     return _key(key_path())
 

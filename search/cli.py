@@ -192,7 +192,7 @@ def search(
         from search import evolve
         from search.config import load_config
         from search.pool import WorkerPool
-        from search.storage import without_password
+        from search.storage import storage_name
 
         changes: dict[str, Any] = {"stages": stages, "pruner": pruner}
         settings = replace(load_config(config), **{key: value for key, value in changes.items() if value is not None})
@@ -214,11 +214,11 @@ def search(
             )
         elif workers != 0:
             launch = partial(WorkerPool, n_workers=workers or 1, threads=threads)
-        console.print(f"Study {settings.name} in {without_password(where)}", soft_wrap=True, markup=False)
+        console.print(f"Study {settings.name} in {storage_name(where)}", soft_wrap=True, markup=False)
         shown = _show_progress(evolve.search(settings, path, where, launch, heartbeat))
         if shown is not None and shown.best is not None:
             console.print(f"Best so far: {shown.best_loss}, score {shown.best:.2f}", markup=False, soft_wrap=True)
-        option = "" if storage is None else f" --storage {without_password(storage)}"
+        option = "" if storage is None else f" --storage {storage_name(storage)}"
         console.print(f"To watch it: aarl dashboard {path}{option}", markup=False, soft_wrap=True)
 
 
@@ -246,9 +246,9 @@ def worker(
 
         from search import evolve
         from search.pool import WorkerPool
-        from search.storage import without_password
+        from search.storage import storage_name
 
-        console.print(f"Working for {without_password(storage)}", soft_wrap=True, markup=False)
+        console.print(f"Working for {storage_name(storage)}", soft_wrap=True, markup=False)
         launch = partial(WorkerPool, n_workers=workers, threads=threads)
         _show_progress(evolve.join(storage, study, folder, launch, heartbeat, wait))
 
@@ -549,8 +549,8 @@ def dashboard(
 ) -> None:
     """Watch a search in optuna-dashboard."""
     with clear_errors():
-        from search.dashboard import serve, update_plots
-        from search.evolve import ARTIFACTS, CONFIG_KEY
+        from search.dashboard import ARTIFACTS, serve, update_plots
+        from search.evolve import CONFIG_KEY
         from search.report import stored_baselines
         from search.storage import load_study, open_storage
 

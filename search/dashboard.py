@@ -15,22 +15,25 @@ from typing import Any
 from optuna import Study
 from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 from optuna.storages import BaseStorage
-from optuna.trial import FrozenTrial
+from optuna.trial import FrozenTrial, TrialState
 from optuna_dashboard import run_server, save_note, save_plotly_graph_object
+from optuna_dashboard._note import get_note_from_system_attrs
 from optuna_dashboard.artifact import get_artifact_path
 
 from sb3_aarl.aux_loss import AuxLoss
 from search.notation import subscripts
 from search.plots import evolution_figure, learning_curve_png
-from search.trials import curve_of, lineage, loss_of, operation_of, parents_of, score_of, stage_of
+from search.trials import curve_of, lineage, loss_of, operation_of, parents_of, score_of, stage_of, trained_loss_of
 
+ARTIFACTS = "artifacts"  # folder of the pictures in notes
 PLOT_ID = "evolution"
 # Notes live in the attributes of the study, of which every worker and every page of the dashboard reads all.
 MAX_ANCESTORS = 12
 MAX_CURVE_ROWS = 20
 MAX_TEXT = 300
+BEGUN = "**State:** begun"
 
-HOW_TO_READ = """\
+HOW_TO_READ_SEARCH = """\
 - Each **trial** trains one candidate: an auxiliary loss `{source} -> {target}`, from which tokens of a window of \
 experience which others are predicted. Its value is the area under its learning curve, its note says what it is.
 - **Stages**: the best quarter of a stage are the parents of the next. The trials' user attributes `stage`, \
@@ -38,19 +41,36 @@ experience which others are predicted. Its value is the area under its learning 
 - The plot **evolution** shows the scores of all candidates by stage. The parameters are one boolean for every token, \
 so that their importances are the tokens'."""
 
+HOW_TO_READ_RUNS = """\
+Each **trial** is one training of a list that was given: its user attributes `variant`, `environment` and `seed` tell \
+which. Its value is the area under its learning curve. Nothing is searched here, so trials have no parameters."""
 
-def annotate_study(study: Study, settings: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
+
+def artifacts(folder: Path) -> FileSystemArtifactStore:
+    """
+    Where the pictures of a run's folder are.
+
+    :param folder: Folder of the run, made if it is not there
+    """
+    path = folder / ARTIFACTS
+    path.mkdir(parents=True, exist_ok=True)
+    return FileSystemArtifactStore(path)
+
+
+def annotate_study(study: Study, settings: Mapping[str, Any], provenance: Mapping[str, Any], is_search: bool = True) -> None:
     """
     Write the study's note: what is searched, with which settings, on which commit, and how to read it.
 
     :param study: The study
-    :param settings: Names and values of the search's settings
+    :param settings: Names and values of its settings
     :param provenance: As ``search.provenance.provenance`` gives it
+    :param is_search: False for a list of given runs
     """
-    note = [f"## Search for auxiliary losses: {_escape(study.study_name)}", HOW_TO_READ]
-    for title, values in (("Settings", settings), ("Where it comes from", provenance)):
+    title = "Search for auxiliary losses" if is_search else "Trainings"
+    note = [f"## {title}: {_escape(study.study_name)}", HOW_TO_READ_SEARCH if is_search else HOW_TO_READ_RUNS]
+    for heading, values in (("Settings", settings), ("Where it comes from", provenance)):
         rows = [(_escape(name), _escape(value)) for name, value in values.items()]
-        note += [f"### {title}", _table(("name", "value"), rows)]
+        note += [f"### {heading}", _table(("name", "value"), rows)]
     save_note(study, "\n\n".join(note))
 
 
@@ -68,7 +88,7 @@ def annotate_trial(study: Study, trial: FrozenTrial | int, artifact_store: FileS
     trial = trials[trial if isinstance(trial, int) else trial.number]
     # Until all seeds are done there is what was reported of the first.
     reported = [(step, mean, math.nan) for step, mean in sorted(trial.intermediate_values.items())]
-    loss, curve = loss_of(trial), curve_of(trial) or reported
+    loss, curve = trained_loss_of(trial), curve_of(trial) or reported
     note = [*_loss_lines(trial, loss), _origin(trial)]
     if "reason" in trial.user_attrs:
         note.append(f"**Reason:** {_escape(trial.user_attrs['reason'])}")
@@ -85,6 +105,19 @@ def annotate_trial(study: Study, trial: FrozenTrial | int, artifact_store: FileS
         if len(ancestors) > len(nearest):
             note.append(f"… and {len(ancestors) - len(nearest)} more ancestors.")
     save_note(_noted(study, trial), "\n\n".join(note))
+
+
+def annotate_ended(study: Study, artifact_store: FileSystemArtifactStore) -> None:
+    """
+    Write the notes of failed trials again that still say that they run: their workers died, or were interrupted.
+
+    :param study: The study
+    :param artifact_store: As for :func:`annotate_trial`
+    """
+    attrs = study._storage.get_study_system_attrs(study._study_id)
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.FAIL,)):
+        if BEGUN in get_note_from_system_attrs(attrs, trial._trial_id)["body"]:
+            annotate_trial(study, trial, artifact_store)
 
 
 def update_plots(study: Study, baselines: Iterable[tuple[str, float]] = ()) -> None:
@@ -113,6 +146,9 @@ def serve(storage: BaseStorage, artifact_path: str | Path, host: str = "127.0.0.
 
 def _loss_lines(trial: FrozenTrial, loss: AuxLoss | None) -> list[str]:
     # The dashboard shows no HTML in notes, unless it is told to trust all of them with scripts: no MathML there.
+    variant = trial.user_attrs.get("variant")
+    if loss is None and variant is not None:
+        return [f"### {_escape(variant)}", *(["No auxiliary loss."] if trial.user_attrs.get("loss") == "none" else [])]
     if loss is None:
         return [f"### Trial {trial.number}", "It has no valid loss."]
     canonical = f"Canonical: `{loss.canonical()}`" if loss.canonical() != loss else "This is its canonical form."
@@ -126,8 +162,11 @@ def _wrap(latex: str, width: int) -> list[str]:
 
 def _origin(trial: FrozenTrial) -> str:
     score, parents = score_of(trial), parents_of(trial)
-    state = trial.state.name.lower() if trial.state.is_finished() else "begun"
-    text = f"**Score:** {score:.2f}" if score is not None else f"**State:** {state}"
+    ended = f"**Score:** {score:.2f}" if score is not None else f"**State:** {trial.state.name.lower()}"
+    text = ended if trial.state.is_finished() else BEGUN
+    if "variant" in trial.user_attrs:
+        cell = {name: trial.user_attrs.get(name) for name in ("variant", "environment", "seed")}
+        return text + "".join(f". **{name.capitalize()}:** {_escape(value)}" for name, value in cell.items()) + "."
     text += f". **Stage:** {stage_of(trial)}. **Operation:** {_escape(operation_of(trial))}"
     return text + (f" of trial {' and trial '.join(map(str, parents))}." if parents else ".")
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
@@ -10,15 +11,13 @@ from typing import Any, NamedTuple
 
 import optuna
 import yaml
-from optuna.artifacts import FileSystemArtifactStore
-from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
 from search import grid, workers
 from search.config import SearchConfig, load_config
-from search.dashboard import annotate_study, annotate_trial, update_plots
+from search.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts, update_plots
 from search.objective import CandidateFailed, DiskError, Objective, causes, check_study, disk_problem, make_pruner
 from search.pool import Pool, uninterrupted
 from search.provenance import provenance
@@ -36,7 +35,6 @@ POLL_SECONDS = 1.0
 PLOT_SECONDS = 300.0
 # Seconds between two looks for a search that has not been begun.
 WAIT_SECONDS = 10.0
-ARTIFACTS = "artifacts"  # folder of the pictures in notes
 # User attribute of a study: its configuration and file of hyper-parameters as text, for workers of other machines.
 CONFIG_KEY = "config"
 
@@ -125,7 +123,7 @@ def stored_config(study: optuna.Study, folder: Path) -> SearchConfig:
         raise ValueError(f"study {name!r} has no configuration: begin it, or go on with it, with aarl search")
     expected = {f"{name}.yml", f"{name}-hyperparameters.yml"}
     is_text = isinstance(texts, dict) and texts.keys() == expected and all(isinstance(text, str) for text in texts.values())
-    if not is_text or Path(name).name != name:
+    if not is_text or Path(name).name != name or name == "..":
         raise ValueError(f"study {name!r} has a configuration of another kind")
     folder = folder / "config"
     for file, text in texts.items():
@@ -159,14 +157,14 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
     config = stored_config(load_study(storage, name), folder)
     sampler = AuxLossSampler(**config.sampler_settings())
     study = optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=make_pruner(config))
-    artifacts = _artifacts(folder)
+    pictures = artifacts(folder)
     failures = 0
     current: int | None = None
 
     def begun(trial: optuna.Trial) -> None:
         nonlocal current
         current = trial.number
-        annotate_trial(study, current, artifacts)
+        annotate_trial(study, current, pictures)
 
     objective = Objective(config, folder / "candidates", on_begin=begun)
 
@@ -174,10 +172,13 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
         nonlocal current, failures
         current = None
         with uninterrupted():
-            annotate_trial(study, trial, artifacts)
-        failures = failures + 1 if trial.state == TrialState.FAIL else 0
+            annotate_trial(study, trial, pictures)
         reason = trial.user_attrs.get("reason")
-        if failures:
+        if trial.state != TrialState.FAIL:
+            failures = 0
+            return
+        failures += not trial.user_attrs.get(workers.DIED_KEY)  # the same one goes on, ``retries`` times
+        if reason is not None:
             logger.warning("Trial %d failed: %s", trial.number, reason)
         if failures == MAX_FAILURES:
             raise ValueError(f"{failures} candidates failed one after the other, the last one: {reason}")
@@ -200,11 +201,11 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
                 if isinstance(storage, Outlasting):
                     storage.patience = 0.0  # a server that is away must not keep a worker that is to end
                 with uninterrupted(), contextlib.suppress(Exception):  # it is an interruption, whatever becomes of the note
-                    annotate_trial(study, current, artifacts)
+                    annotate_trial(study, current, pictures)
             raise
         except Exception as error:
             # A laptop that slept: others took this worker for dead and failed its trial, whose place they give out again.
-            if isinstance(error, UpdateFinishedTrialError) or str(error).startswith("Cannot tell a FAIL trial"):
+            if workers.was_failed(error):
                 logger.warning("A trial of this worker was failed by another one meanwhile: %s", error)
                 continue
             if problem := disk_problem(error, folder):
@@ -243,7 +244,7 @@ def search(
     keep_config(study, config)
     annotate_study(study, settings(config), provenance())
     yield progress
-    yield from _drawn(_fill(study, sampler, launch, folder, where, heartbeat), study, config)
+    yield from _drawn(_fill(study, sampler, launch, folder, where, heartbeat), study, config, folder)
 
 
 def join(
@@ -272,29 +273,37 @@ def join(
             storage = open_storage(where, create=False)
             searches = [study.study_name for study in storage.get_all_studies() if CONFIG_KEY in study.user_attrs]
             study = load_study(storage, searches[0] if name is None and len(searches) == 1 else name)
-            break
+            if CONFIG_KEY in study.user_attrs or time.monotonic() > deadline:
+                break
+            problem: object = "it has no configuration yet"
         except ValueError as error:
             if time.monotonic() > deadline:
                 raise
-            logger.warning("Waiting for the search to be begun: %s", error)
-            time.sleep(min(WAIT_SECONDS, max(0.0, deadline - time.monotonic())))
+            problem = error
+        logger.warning("Waiting for the search to be begun: %s", problem)
+        time.sleep(min(WAIT_SECONDS, max(0.0, deadline - time.monotonic())))
     folder = folder or Path("runs") / study.study_name
     config = stored_config(study, folder)
     check_study(study, config)
     sampler = AuxLossSampler(**config.sampler_settings())
     yield look(study, sampler)
-    yield from _drawn(_fill(study, sampler, launch, folder, where, heartbeat), study, config)
+    yield from _drawn(_fill(study, sampler, launch, folder, where, heartbeat), study, config, folder)
 
 
-def _drawn(progresses: Iterator[Progress], study: optuna.Study, config: SearchConfig) -> Iterator[Progress]:
-    """Draw the evolution now and then, and at the end."""
-    ended, drawn = -1, 0.0
+def _drawn(progresses: Iterator[Progress], study: optuna.Study, config: SearchConfig, folder: Path) -> Iterator[Progress]:
+    """Draw the evolution now and then, and at the end; what dead workers could not note likewise."""
+    ended, drawn = -1, -math.inf
+
+    def draw() -> None:
+        update_plots(study, baseline_scores(config, study._storage))
+        annotate_ended(study, artifacts(folder))
+
     for progress in progresses:
         if _ended(progress) != ended and time.monotonic() - drawn > PLOT_SECONDS:
-            update_plots(study, baseline_scores(config, study._storage))
+            draw()
             ended, drawn = _ended(progress), time.monotonic()
         yield progress
-    update_plots(study, baseline_scores(config, study._storage))
+    draw()
 
 
 def _fill(
@@ -338,9 +347,3 @@ def look(study: optuna.Study, sampler: AuxLossSampler) -> Progress:
         None if best is None else str(loss_of(best)),
         sum(durations) / len(durations) * left / n_workers if durations else None,
     )
-
-
-def _artifacts(folder: Path) -> FileSystemArtifactStore:
-    path = folder / ARTIFACTS
-    path.mkdir(parents=True, exist_ok=True)
-    return FileSystemArtifactStore(path)

@@ -18,12 +18,15 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_aarl.aux_loss import AuxLoss
 from search import workers
 from search.config import SearchConfig
+from search.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts
 from search.objective import CandidateFailed, DiskError, Objective, disk_problem
-from search.pool import WorkerPool
+from search.pool import WorkerPool, uninterrupted
+from search.provenance import provenance
 from search.storage import PATIENCE, open_storage, study_id
 
-# How often a run is tried that fails, or whose worker dies.
+# How often a run is tried that fails, and one whose worker dies: it goes on from its checkpoint.
 MAX_TRIES = 3
+MAX_DEATHS = 10
 POLL_SECONDS = 1.0
 # User attribute of a study: what decides the scores, by what is trained.
 TRAINING_KEY = "training"
@@ -197,6 +200,8 @@ def run(grid: Runs, folder: Path, where: str, n_workers: int = 1, threads: int |
     storage = open_storage(where)
     study = optuna.create_study(study_name=grid.name, storage=storage, direction="maximize", load_if_exists=True)
     check_training(study, grid.trainings)
+    settings = {f"{name}s": ", ".join(dict.fromkeys(str(getattr(cell, name)) for cell in grid.cells)) for name in Cell._fields}
+    annotate_study(study, settings | grid.trainings, provenance(), is_search=False)
     _enqueue(study, grid.cells)
     finished, failed = _count(study, grid.cells)
     yield finished, failed
@@ -210,6 +215,7 @@ def run(grid: Runs, folder: Path, where: str, n_workers: int = 1, threads: int |
                 finished, failed = _count(study, grid.cells)
                 yield finished, failed
         while not _enqueue(study, grid.cells):
+            annotate_ended(study, artifacts(folder))
             running = study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.WAITING))
             finished, failed = _count(study, grid.cells)  # after that: none of these is overlooked
             yield finished, failed
@@ -269,10 +275,12 @@ def _enqueue(study: optuna.Study, cells: Sequence[Cell]) -> int:
     workers.fail_dead(study, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)), all_have_names=True)
     trials = study.get_trials(deepcopy=False)
     there = {_cell_of(trial) for trial in trials if trial.state not in (TrialState.FAIL, TrialState.PRUNED)}
-    failures = Counter(
-        _cell_of(trial) for trial in trials if trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted")
-    )
-    missing = [cell for cell in cells if cell not in there and failures[cell] < MAX_TRIES]
+    failed = [trial for trial in trials if trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted")]
+    died = [trial for trial in failed if workers.DIED_KEY in trial.user_attrs]
+    deaths, tries = Counter(map(_cell_of, died)), Counter(map(_cell_of, failed))
+    missing = [
+        cell for cell in cells if cell not in there and tries[cell] - deaths[cell] < MAX_TRIES and deaths[cell] < MAX_DEATHS
+    ]
     for cell in missing:
         # As attributes: parameters of Optuna could not take a seed more when a grid grows.
         study.enqueue_trial({}, user_attrs=cell._asdict())
@@ -299,6 +307,13 @@ def _run_worker(grid: Runs, folder: Path, where: str) -> None:
         study_name=grid.name, storage=open_storage(where, patience=PATIENCE), sampler=RandomSampler(seed=0), pruner=NopPruner()
     )
 
+    def finished(study: optuna.Study, trial: FrozenTrial) -> None:
+        if "curve" in trial.user_attrs or trial.state == TrialState.FAIL:
+            with uninterrupted():
+                annotate_trial(study, trial, pictures)
+
+    pictures = artifacts(folder)
+
     def objective(trial: optuna.Trial) -> float:
         cell = _cell_of(trial)
         if cell is None:
@@ -309,12 +324,15 @@ def _run_worker(grid: Runs, folder: Path, where: str) -> None:
         begun = study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.COMPLETE))
         if any(_cell_of(other) == cell and other.number < trial.number for other in begun):
             raise optuna.TrialPruned("two programs that began at the same moment enqueued this run; the other one has it")
+        annotate_trial(study, trial.number, pictures)
         return grid.train(trial, cell, folder)
 
     while study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
         try:
-            study.optimize(objective, n_trials=1, catch=(CandidateFailed,), gc_after_trial=True)
+            study.optimize(objective, n_trials=1, catch=(CandidateFailed,), callbacks=[finished], gc_after_trial=True)
         except Exception as error:
+            if workers.was_failed(error):
+                continue
             if problem := disk_problem(error, folder):
                 raise DiskError(problem) from None
             raise

@@ -24,7 +24,8 @@ from search.config import SearchConfig
 from search.provenance import commit, cpu
 from search.space import distributions, suggest_aux_loss
 from search.storage import study_id
-from search.training import TrainingError, train_candidate
+from search.training import EnvironmentLost, TrainingError, train_candidate
+from search.workers import DIED_KEY
 
 # The words of SQLite and PostgreSQL for a disk that cannot be written.
 DISK_MESSAGES = (
@@ -55,8 +56,8 @@ class Objective:
 
     User attributes of a trial: ``loss`` (notation), ``canonical``, ``environment``, ``commit``, ``device`` (name of the GPU
     or the processor), ``threads``; ``curve`` (a list of [environment steps, mean, standard deviation] over the episodes
-    of all seeds) and ``seconds`` of training when it ends; ``reason`` when it fails; ``interrupted`` when Ctrl-C or a full
-    disk stopped it.
+    of all seeds) and ``seconds`` of training when it ends; ``reason`` when it fails, and ``died`` where the process of an
+    environment did; ``interrupted`` when Ctrl-C or a full disk stopped it.
 
     ``study.optimize(objective, catch=CandidateFailed)`` goes on after a candidate that failed.
 
@@ -210,6 +211,8 @@ def end_noted(trial: optuna.Trial, folder: Path | None = None) -> Iterator[None]
                 _note_interruption(trial)
             raise
         trial.set_user_attr("reason", reason)
+        if isinstance(error, EnvironmentLost):
+            trial.set_user_attr(DIED_KEY, True)
         raise CandidateFailed(reason) from error
 
 

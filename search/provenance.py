@@ -13,7 +13,7 @@ from typing import Any
 
 import torch as th
 
-from search.storage import without_password
+from search.storage import storage_name
 
 PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "shimmy", "optuna", "numpy")
 
@@ -58,7 +58,7 @@ def provenance() -> dict[str, str]:
     return {
         "commit": commit(),
         # It stands in notes and reports, which others read.
-        "command": without_password(" ".join([Path(sys.argv[0]).name, *sys.argv[1:]])),
+        "command": " ".join(storage_name(argument) for argument in [Path(sys.argv[0]).name, *sys.argv[1:]]),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "cpu": cpu(),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else "none",

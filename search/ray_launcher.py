@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from search.pool import INTERRUPT_SECONDS, MAX_DEATHS, WorkerError, _interrupt_again, _interrupt_once, message
-from search.storage import without_password
+from search.storage import storage_name, without_password
 
 try:
     import ray
@@ -270,16 +270,16 @@ def _joined(address: str | None) -> Iterator[None]:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
             local: dict[str, Any] = {"num_cpus": cores, "include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
             try:
-                ray.init(address="local", **local, **quiet)
+                _init(address="local", **local, **quiet)
             except (ValueError, OSError, RuntimeError, RayError) as error:
                 # On a busy machine its server may not be up in the time that Ray gives it.
                 if "Timed out" not in str(error):
                     raise
                 ray.shutdown()
-                ray.init(address="local", **local, **quiet)
+                _init(address="local", **local, **quiet)
         else:
             _check_address(address)
-            ray.init(address=address, **quiet)
+            _init(address=address, **quiet)
     except (ValueError, OSError, RuntimeError, RayError) as error:
         reason = str(error).partition("\n")[0]
         raise ValueError(f"no Ray at {address}: {reason}" if address else f"Ray did not start: {reason}") from None
@@ -289,6 +289,17 @@ def _joined(address: str | None) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
+
+
+def _init(**arguments: Any) -> None:
+    """Ray shows the whole cluster the command that joined it, which may have a storage's password."""
+    utils = ray._private.utils
+    original = utils.get_entrypoint_name
+    utils.get_entrypoint_name = lambda: without_password(original())
+    try:
+        ray.init(**arguments)
+    finally:
+        utils.get_entrypoint_name = original
 
 
 def _check_address(address: str) -> None:
@@ -317,6 +328,6 @@ def check_storage(where: str) -> None:
     others = sorted({" ".join(machine) for machine in machines.values() if machine != machines[here]})
     if others:
         raise ValueError(
-            f"the storage {without_password(where)} is on this machine, but Ray has nodes on others ({', '.join(others)}): "
+            f"the storage {storage_name(where)} is on this machine, but Ray has nodes on others ({', '.join(others)}): "
             "take one that they reach, --storage postgresql://... or grpc://..."
         )

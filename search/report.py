@@ -162,6 +162,7 @@ def write_report(
     if settings is None:
         settings = study.user_attrs.get(grid.TRAINING_KEY, {}).get("candidates", {})
     winner = best[0] if best else None
+    n_seeds = len(settings.get("seeds", ()))
     machines = analysis.machines(trials)
     html = _TEMPLATE.render(
         study=study,
@@ -174,6 +175,7 @@ def write_report(
         baselines=baselines,
         best=[_row(trial) for trial in best[:N_BEST]],
         winner=_row(winner) if winner else None,
+        trainings=f"mean of {n_seeds} trainings" if n_seeds > 1 else "one training",
         lineage=[_row(other) for other in sorted(lineage(winner, trials), key=lambda other: -other.number)] if winner else [],
         validation=_validation(validation),
         taught=_taught(study, trials),
@@ -382,8 +384,8 @@ under its learning curve (AULC): the mean evaluation return.</p>
 <p><strong>This study is empty: no trial has begun yet.</strong></p>
 {% endif %}
 {% if winner %}
-<div class="winner"><strong>Best so far: {{ number(winner.score) }}</strong> (trial {{ winner.number }}, one training; the top
-candidates should be trained again with other seeds)
+<div class="winner"><strong>Best so far: {{ number(winner.score) }}</strong> (trial {{ winner.number }}, {{ trainings }}; the
+top candidates should be trained again with other seeds)
 {{ winner.loss }}</div>
 {% elif trials %}
 <p><strong>No trial has a score yet.</strong></p>

@@ -93,6 +93,9 @@ class _Register:
         self.open: set[int] = set()  # numbers of trials that are not finished
         self.places: dict[int, tuple[int, int]] = {}  # stage and place of each trial that has one
         self.holders: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # and the other way, in order
+        # Of each stage: places that somebody has, and those of them that are filled.
+        self.taken: defaultdict[int, set[int]] = defaultdict(set)
+        self.filled: defaultdict[int, set[int]] = defaultdict(set)
         # Trials with parameters but no place: once seen, and seen again. A database reads the parameters of a trial a
         # little later than its place, so that a trial of this sampler may look like that once.
         self._suspects: set[int] = set()
@@ -104,15 +107,25 @@ class _Register:
         for number in changed:
             claim = trials[number].system_attrs.get(PLACE_KEY)
             place = None if claim is None else (claim["stage"], claim["place"])
-            if place != self.places.get(number):
-                if number in self.places:
+            before = self.places.get(number)
+            if place != before:
+                if before is not None:
                     self.holders[self.places.pop(number)].remove(number)
+                    self._count(*before)
                 if place is not None:
                     self.places[number] = place
                     bisect.insort(self.holders[place], number)
+            if place is not None:
+                self._count(*place)
             if place is None and trials[number].params:
                 (self._strangers if number in self._suspects else self._suspects).add(number)
             (self.open.discard if trials[number].state.is_finished() else self.open.add)(number)
+
+    def _count(self, stage: int, place: int) -> None:
+        holders = self.held_by(stage, place)
+        (self.taken[stage].add if holders else self.taken[stage].discard)(place)
+        is_filled = bool(holders) and holders[0].state in FILLED
+        (self.filled[stage].add if is_filled else self.filled[stage].discard)(place)
 
     def held_by(self, stage: int, place: int) -> list[FrozenTrial]:
         """The trials that have the place, waiting, running or finished: one at most once all have chosen."""
@@ -312,10 +325,13 @@ class AuxLossSampler(BaseGASampler):
         """Give the trial a place. Waits for one where there is none, and for trials before it that still choose."""
         self._raise_error_if_multi_objective(study)
         try:
+            # Signs of life from the beginning on, where study.optimize will go on with them, and before the name: a trial
+            # with a name but without any sign would be alive for ever on another machine.
+            wait = _Wait(study, trial, beats=_in_optimize(study, None) is not None)
             worker = workers.identity() if self.worker == "auto" else self.worker
             if worker != trial.user_attrs.get(workers.WORKER_KEY):  # a heartbeat's copy has the name of the dead
                 _show(study, trial, workers.WORKER_KEY, worker)
-            self._find_place(study, trial)
+            self._find_place(study, trial, wait)
         except BaseException:
             # Interrupted while it waited, or nothing is left to do.
             with contextlib.suppress(UpdateFinishedTrialError):
@@ -363,7 +379,8 @@ class AuxLossSampler(BaseGASampler):
             return
         # What study.optimize does not catch ends the program: it is started again as after any other death.
         ends = frame is not None and error is not None and not isinstance(error, frame.f_locals["catch"])
-        failed = state == TrialState.FAIL and not trial.user_attrs.get("interrupted") and not ends
+        innocent = ends or trial.user_attrs.get("interrupted") or trial.user_attrs.get(workers.DIED_KEY)
+        failed = state == TrialState.FAIL and not innocent
         if failed or (state == TrialState.PRUNED and loss_of(trial) is None):
             study._storage.set_trial_system_attr(trial._trial_id, REJECTED_KEY, True)
 
@@ -377,6 +394,13 @@ class AuxLossSampler(BaseGASampler):
         with self._lock:
             self._refresh(study)
             return self._population(generation + 1)
+
+    def get_parent_population(self, study: Study, generation: int) -> list[FrozenTrial]:
+        """
+        As :meth:`select_parent`, none for generation 0. Optuna would keep its first answer, even of a stage that is not
+        complete yet.
+        """
+        return self.select_parent(study, generation) if generation > 0 else []
 
     def select_parent(self, study: Study, generation: int) -> list[FrozenTrial]:
         """The parents of a stage (from 0): the best of the one before, the best first."""
@@ -417,9 +441,7 @@ class AuxLossSampler(BaseGASampler):
             if begun.get(name) != value:
                 raise ValueError(f"this study was begun with {name}={begun.get(name)!r}, not {value!r}: use another study")
 
-    def _find_place(self, study: Study, trial: FrozenTrial) -> None:
-        # Signs of life from the beginning on, where study.optimize will go on with them.
-        wait = _Wait(study, trial, beats=_in_optimize(study, None) is not None)
+    def _find_place(self, study: Study, trial: FrozenTrial, wait: "_Wait") -> None:
         while True:
             with self._lock:
                 self._refresh(study)
@@ -457,13 +479,15 @@ class AuxLossSampler(BaseGASampler):
             raise SearchComplete(f"all {self.n_stages} stages of the search are complete")
         free = [(stage, place) for place in self._free(stage)]
         if len(free) <= n and (self.n_stages is None or stage < self.n_stages):
-            free += [(stage + 1, place) for place in self._free(stage + 1) if self.operations(stage + 1)[place] == "random"]
+            random = range(n_random(self.operations(stage + 1)))
+            free += [(stage + 1, place) for place in self._free(stage + 1) if place in random]
         if enqueued:
             free.sort(key=lambda at: self.operations(at[0])[at[1]] != "random")
         return free[n] if n < len(free) else None
 
     def _free(self, stage: int) -> list[int]:
-        return [place for place in range(len(self.operations(stage))) if not self._register.held_by(stage, place)]
+        taken = self._register.taken[stage]
+        return [place for place in range(len(self.operations(stage))) if place not in taken]
 
     def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int, is_given: bool) -> bool:
         """Take a place for a trial; False if another one has it too."""
@@ -651,9 +675,9 @@ class _Evolution:
         """How many stages are complete; takes note of the trials of those that have become so."""
         while True:
             stage = len(self._losses) + 1
-            holders = [holder for place in range(self._size(stage)) for holder in register.held_by(stage, place)[:1]]
-            if len(holders) < self._size(stage) or any(holder.state not in FILLED for holder in holders):
+            if len(register.filled[stage]) < self._size(stage):
                 return stage - 1
+            holders = [register.held_by(stage, place)[0] for place in range(self._size(stage))]
             self._plan_random(stage + 1)  # while the stage before is still the last one known
             losses = {holder.number: loss for holder in holders if (loss := loss_of(holder)) is not None}
             if not losses:

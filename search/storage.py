@@ -4,6 +4,7 @@ import contextlib
 import functools
 import json
 import logging
+import math
 import os
 import re
 import sys
@@ -51,6 +52,8 @@ PROXY_TIMEOUT = 5.0
 # Calls that the proxy serves at a time, each with a connection of its own. Those that wait together share a reading: 32
 # workers had 7.0 trials a second with 34, 6.0 with 16 and 5.9 with 4; 5.2 with 4 before readings were shared.
 PROXY_THREADS = 32
+# Seconds between two looks at signs of life after which watching begins anew, where the signs come faster.
+LATE_SECONDS = 10.0
 # User attribute of a study.
 ID_KEY = "id"
 # System attribute of a trial: changes with each sign of life of its worker.
@@ -108,16 +111,20 @@ class JournalFile(JournalFileBackend):
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
         """Cut off what was never finished, then write."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
-        with get_lock_file(self._file_lock), self._path.open("rb+") as file:
+        with get_lock_file(self._file_lock), open(self._path, "rb+", opener=_appending) as file:
             if file.seek(0, os.SEEK_END) > 0:
                 file.seek(-1, os.SEEK_END)
                 if file.read(1) != b"\n":
                     file.seek(0)
                     file.truncate(file.read().rfind(b"\n") + 1)
-                    file.seek(0, os.SEEK_END)
             file.write(lines.encode())
             file.flush()
             os.fsync(file.fileno())
+
+
+def _appending(path: str, flags: int) -> int:
+    """Opens a file that is there; what others append meanwhile is not written over."""
+    return os.open(path, flags | os.O_APPEND)
 
 
 class ServerLost(StorageInternalError):
@@ -204,14 +211,15 @@ class _Watch:
     """
     For how long signs have not changed, as far as this process kept watching: it may have slept, or had no network.
 
-    :param gap: Seconds between two looks after which watching begins anew. Looks that follow faster than a twentieth of
-        it are saved
+    :param gap: Seconds between two looks after which watching begins anew, or ``LATE_SECONDS`` if that is longer. A look
+        vouches for half of it at most: where signs come faster than this process can look, it takes more looks. Those that
+        follow faster than a twentieth of it are saved
     """
 
     def __init__(self, gap: float):
         self._gap = gap
-        self._looked = -gap
-        self._since: dict[int, tuple[Any, float]] = {}
+        self._looked = -math.inf
+        self._seconds: dict[int, tuple[Any, float]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _Watch, (self._gap,)  # another process has another clock
@@ -225,14 +233,15 @@ class _Watch:
             return {}
         signs = look()
         now = time.monotonic()
-        if now - self._looked > self._gap:
-            self._since = {}
-        self._looked = now
-        known = self._since
-        self._since = {
-            key: known[key] if key in known and known[key][0] == sign else (sign, now) for key, sign in signs.items()
+        seconds, self._looked = now - self._looked, now
+        if seconds > max(self._gap, LATE_SECONDS):
+            self._seconds = {}
+        known, seconds = self._seconds, min(seconds, self._gap / 2)
+        self._seconds = {
+            key: (sign, known[key][1] + seconds) if key in known and known[key][0] == sign else (sign, 0.0)
+            for key, sign in signs.items()
         }
-        return {key: (sign, now - since) for key, (sign, since) in self._since.items()}
+        return self._seconds
 
 
 class WithHeartbeat(BaseStorage, BaseHeartbeat):
@@ -242,7 +251,7 @@ class WithHeartbeat(BaseStorage, BaseHeartbeat):
     A trial is stale when its sign has not changed while this process watched for two intervals of the trial's own worker,
     which the sign names. No clocks are compared,
     and nobody is blamed for a time in which the server, the network or this process stood still. So somebody has to
-    look more often than once an interval, as workers do that wait for a place: as long as none waits, nobody needs the
+    look once an interval at least, as workers do that wait for a place: as long as none waits, nobody needs the
     place of a stale trial. Trials without any sign (of a user's own ``ask``) are never stale.
     """
 
@@ -485,8 +494,7 @@ def open_storage(
         Passwords are left out of the message. Nothing that is there and no storage is changed
     """
     where = str(where)
-    # Without blanks, which are an error in a URL, and would hide where its password ends.
-    shown = without_password("".join(where.split()) if "://" in where else where)
+    shown = storage_name(where)
     try:
         if "://" not in where:
             return _open_journal(where, create, heartbeat_interval)
@@ -522,7 +530,8 @@ def _open_journal(where: str, create: bool, heartbeat_interval: int) -> Journal:
         if not JOURNAL_BEGIN.startswith(begin):
             raise ValueError(f"{path} is no journal of Optuna")
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock_path = path.with_name(f"{path.name}.lock")
+    # Not .lock, the file of Optuna's own lock, which removes what it takes for that of a dead process.
+    lock_path = path.with_name(f"{path.name}.flock")
     lock = JournalFileOpenLock(str(path.absolute())) if sys.platform == "win32" else KernelLock(lock_path)
     try:
         return Journal(JournalFile(path, lock), heartbeat_interval)
@@ -642,7 +651,7 @@ def serve_proxy(where: str, host: str = "127.0.0.1", port: int = 13000) -> None:
     from optuna.storages._grpc.servicer import OptunaStorageProxyService
 
     if "://" not in where or where.startswith("grpc:"):
-        shown = without_password(where)
+        shown = storage_name(where)
         raise ValueError(f"a proxy serves a database, such as postgresql://user@host/database, and not {shown}")
     database = open_storage(where)
     assert isinstance(database, Database)
@@ -662,7 +671,7 @@ def serve_proxy(where: str, host: str = "127.0.0.1", port: int = 13000) -> None:
         problem = "the port is in use, or the address is not one of this machine"
         raise ValueError(f"cannot listen on {host}:{port}: {problem}") from None
     server.start()
-    logger.info("Serving %s on grpc://%s:%d", without_password(where), host, port)
+    logger.info("Serving %s on grpc://%s:%d", storage_name(where), host, port)
     try:
         server.wait_for_termination()
     except KeyboardInterrupt:
@@ -686,8 +695,28 @@ def without_password(text: str) -> str:
     :param text: A URL, a connection string, or a message with such in it
     :return: The same with the passwords replaced by ``***``
     """
-    text = re.sub(r"(\b[a-zA-Z][\w+.-]*:/*[^:/@\s]*):\S*@", r"\1:***@", text)
+    # A user's name may have an @, or a domain before a slash.
+    text = re.sub(r"(\b[a-zA-Z][\w+.-]*:/*[^:\s]*):\S*@", r"\1:***@", text)
     return re.sub(r"(?i)((?:password|passwd|pwd)\s*=\s*)('(?:[^'\\]|\\.)*'|[^&\s]*)", r"\1***", text)
+
+
+def storage_name(where: str) -> str:
+    """
+    What messages call a storage.
+
+    :param where: As for :func:`open_storage`, or another argument of a program
+    :return: The same without a password, even if it is a URL with an error
+    """
+    if "://" not in where:
+        return without_password(where)
+    # Without blanks, which are an error in a URL, and would hide where its password ends.
+    shown = without_password("".join(where.split()))
+    try:
+        _ = urlsplit(shown).port
+    except ValueError:
+        if "@" not in shown and not shown.startswith("grpc:"):  # the host was forgotten, and the password stands for a port
+            return f"{shown.partition('://')[0]}://***"
+    return shown
 
 
 def root_cause(error: BaseException) -> str:

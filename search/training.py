@@ -12,6 +12,7 @@ import pickle
 import re
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,13 +20,13 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
 from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
-from search.checkpoint import CheckpointError, ResumableEnv, is_disk_error, opened, seal, sync_folder, user_key
+from search.checkpoint import CheckpointError, ResumableEnv, is_disk_error, key_path, opened, seal, sync_folder, user_key
 from search.config import VEC_ENVS, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
 
 logger = logging.getLogger(__name__)
@@ -40,6 +41,10 @@ UNFINISHED = "unfinished-"  # name of a checkpoint that is being written
 
 class TrainingError(RuntimeError):
     """A training failed while it ran; the message is the reason in one line."""
+
+
+class EnvironmentLost(TrainingError):
+    """The process of an environment died; the checkpoint stays, as after the death of a worker."""
 
 
 class _Unrelated(BaseException):
@@ -116,8 +121,8 @@ def train_candidate(
     episode that ran is cut off (the buffer takes it for truncated) and one with another seed begins; a line of log says so.
     Checkpoints are signed with a key of the user's, see ``search.checkpoint``: one that is torn, of another user or of
     other settings is refused before anything of it is unpickled, and the training begins anew. When it is over, for
-    whatever reason but an interruption or an error of the disk, the checkpoint is removed and ``curve.csv`` stays; a
-    training whose curve is complete is not repeated.
+    whatever reason but an interruption, the death of an environment's process or an error of the disk, the checkpoint is
+    removed and ``curve.csv`` stays; a training whose curve is complete is not repeated.
 
     With ``n_envs`` environments in the hyper-parameters, all of their steps count, and a checkpoint that lies between two
     steps of them is evaluated after the second. ``gradient_steps: -1`` keeps one update for each transition.
@@ -134,7 +139,9 @@ def train_candidate(
     :param keep_model: Whether to leave the trained model as ``model.zip`` in the folder
     :param progress_bar: Whether to show a progress bar
     :raises TrainingError: when the training fails while it runs, the cause being its ``__cause__``
-    :raises OSError: when the disk is full or broken; the last checkpoint stays, and the same call goes on from it
+    :raises EnvironmentLost: when the process of an environment was killed (``vec_env="subproc"``); the last checkpoint stays
+    :raises OSError: when the disk is full or broken, or there is a checkpoint but no key to read it with; the last checkpoint
+        stays, and the same call goes on from it
     :raises FileExistsError: when the folder has the model of another training
     :raises ValueError: when environment or model cannot be made of these settings
     """
@@ -192,11 +199,11 @@ def train_candidate(
                         store.save_model(model)
             except _Unrelated as unrelated:
                 raise unrelated.error from unrelated.error.__cause__
-            except OSError:
-                raise  # of the disk: the checkpoint waits for a better one
-            except Exception:
-                # Not after an interruption, which is no Exception.
-                if store is not None:
+            except Exception as error:  # an interruption is none
+                if _was_killed(error, env, eval_env):
+                    raise EnvironmentLost("the process of an environment was killed") from error
+                # One of the disk: the checkpoint waits for a better one.
+                if store is not None and not isinstance(error, OSError):
                     store.remove_checkpoint()
                 raise
     else:
@@ -273,6 +280,17 @@ def _closed(env: VecEnv) -> Iterator[VecEnv]:
             env.close()
 
 
+def _was_killed(error: Exception, *envs: VecEnv) -> bool:
+    """Whether it is the process of an environment that is at fault, and was killed. One that raises ends by itself."""
+    if not any(isinstance(each, (EOFError, ConnectionError)) for each in (error, error.__cause__)):
+        return False
+    processes = [process for env in envs if isinstance(env.unwrapped, SubprocVecEnv) for process in env.unwrapped.processes]
+    deadline = time.monotonic() + 5  # its end of the pipe closes a little before it is gone
+    while processes and all(process.exitcode is None for process in processes) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return any((process.exitcode or 0) < 0 for process in processes)
+
+
 def _repeat(curve: Sequence[Evaluation], on_evaluation: Callable[[Evaluation], bool | None] | None) -> bool:
     """Tell of the evaluations of a run that goes on; False if training is to end."""
     return on_evaluation is None or all(on_evaluation(evaluation) is not False for evaluation in curve)
@@ -323,6 +341,8 @@ class _RunFolder:
         saved = [path for path in self._checkpoints.glob("*") if path.name.isdecimal()]
         if saved:
             newest = max(saved, key=lambda path: int(path.name))
+            if user_key() is None and _holds(newest, self.description):
+                raise PermissionError(f"{newest} cannot be read without the key in {key_path()}: mend it, or remove the other")
             try:
                 with opened(newest, user_key()) as (files, about):
                     if not _holds(newest, self.description):
@@ -331,8 +351,8 @@ class _RunFolder:
                     model = SACAux.load(files["model.zip"], env, device=device, force_reset=False)
                     model.load_replay_buffer(files["replay_buffer.pkl"])
                     cut_off = about["cut_off"] or _load_simulations(env, pickle.load(files["environments.pkl"]))
-            except OSError:
-                raise  # of the disk, which says nothing of the checkpoint
+            except (OSError, EOFError):
+                raise  # of the disk, or the process of an environment: they say nothing of the checkpoint
             except Exception as error:  # what other versions do to pickle and torch
                 logger.warning("The checkpoint %s is of no use, training begins anew: %s", newest, error)
             else:
@@ -454,6 +474,8 @@ class _CheckpointCallback(BaseCallback):
             assert isinstance(self.model, SACAux)
             try:
                 self.store.save(self.model, self.curve)
+            except ConnectionError:
+                raise  # to the process of an environment, not to a disk
             except OSError as error:
                 raise _Unrelated(error) from error
             if self.model.use_sde:

@@ -21,6 +21,14 @@ def loss_of(trial: FrozenTrial) -> AuxLoss | None:
         return None
 
 
+def trained_loss_of(trial: FrozenTrial) -> AuxLoss | None:
+    """The loss that a trial trains: :func:`loss_of`, or what was given to a run of a list of runs."""
+    try:
+        return loss_of(trial) or AuxLoss.parse(str(trial.user_attrs.get("loss")))
+    except ValueError:
+        return None
+
+
 def stage_of(trial: FrozenTrial) -> int:
     """The stage of a trial; other samplers than AuxLossSampler have one stage only."""
     stage = trial.user_attrs.get("stage")

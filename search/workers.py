@@ -18,6 +18,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 # User attribute of a trial: the identity of the process that asked for it.
 WORKER_KEY = "worker"
+# User attribute of a failed trial: not its candidate but a process died, of its worker or of an environment.
+DIED_KEY = "died"
 # A worker gives its name milliseconds after it took a trial; after so many seconds without one it has died in between.
 UNNAMED_SECONDS = 60.0
 
@@ -80,9 +82,23 @@ def fail(study: Study, trial: FrozenTrial, reason: str) -> bool:
     storage = study._storage
     try:
         storage.set_trial_user_attr(trial._trial_id, "reason", reason)
+        storage.set_trial_user_attr(trial._trial_id, DIED_KEY, True)
         return storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
     except UpdateFinishedTrialError:
         return False
+
+
+def was_failed(error: Exception) -> bool:
+    """
+    Whether a worker stumbled over its trial having been failed by another one, who took it for dead: a laptop that slept.
+
+    :param error: What ``study.optimize`` raised
+    """
+    # Where the objective has returned, Optuna stumbles once more over its own exception.
+    return any(
+        isinstance(each, UpdateFinishedTrialError) or str(each).startswith("Cannot tell a FAIL trial")
+        for each in (error, error.__context__)
+    )
 
 
 def beat(storage: BaseStorage, trial_id: int) -> None:
@@ -105,8 +121,8 @@ def fail_dead(
     Fail the running trials whose worker is gone, so that their places are given out again.
 
     Of this machine it is known at once which workers have died. Of all machines, and of workers that were stopped, it is
-    known by the signs of life of their trials, where the storage keeps them and this process keeps looking: more often
-    than once a heartbeat interval, for about two of them (see :class:`search.storage.WithHeartbeat`). No callback of the
+    known by the signs of life of their trials, where the storage keeps them and this process keeps looking: once a heartbeat
+    interval at least, for about two of them (see :class:`search.storage.WithHeartbeat`). No callback of the
     storage makes a copy of them: who looks waits for a place itself, and could not take the copy's.
 
     :param study: The study

@@ -62,9 +62,9 @@ def work(
             os.kill(os.getpid(), signal.SIGKILL)
 
     class Sampler(AuxLossSampler):
-        def _find_place(self, study: Any, trial: Any) -> None:
+        def _find_place(self, study: Any, trial: Any, wait: Any) -> None:
             die("asking", trial)
-            super()._find_place(study, trial)
+            super()._find_place(study, trial, wait)
             die("placed", trial)
 
     def objective(trial: optuna.Trial) -> float:

@@ -16,7 +16,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from sb3_aarl.aux_loss import AuxLoss
-from search import dashboard
+from search import dashboard, workers
 from search.notation import subscripts
 from search.sampler import AuxLossSampler, SearchComplete
 from search.space import distributions, loss_to_params, suggest_aux_loss
@@ -92,6 +92,23 @@ def test_trial_without_a_loss():
     note = note_of(study, 0)
     assert "no valid loss" in note and "**State:** fail" in note
     assert "<script>" not in note and "![x](" not in note and "\n# " not in note
+
+
+def test_who_died_gets_a_note_too(store):
+    study = finished_study(FORWARD, SHIFTED)
+    for number in (2, 3):
+        trial = study.ask(distributions(1))
+        trial.report(7.0, 400)
+        dashboard.annotate_trial(study, number, store)
+        assert "**State:** begun" in note_of(study, number)
+    workers.fail(study, study.trials[2], "its worker died")
+    dashboard.annotate_ended(study, store)
+    assert "**State:** begun" in note_of(study, 3)  # it runs
+    note = note_of(study, 2)
+    assert "**State:** fail" in note and "**Reason:** its worker died" in note and "| 400 | 7.0 | - |" in note
+    dashboard.save_note(dashboard._noted(study, study.trials[2]), "changed")
+    dashboard.annotate_ended(study, store)
+    assert note_of(study, 2) == "changed"
 
 
 def test_picture_is_uploaded_once_for_each_length_of_the_curve(store, tmp_path):

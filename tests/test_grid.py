@@ -1,6 +1,7 @@
 """Lists of runs as studies: what a second program does, and what an older configuration left."""
 
 import itertools
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import optuna
 import pandas as pd
 import pytest
 from optuna.trial import TrialState
+from optuna_dashboard._note import get_note_from_system_attrs
 
 from sb3_aarl import catalog
 from search import evolve, grid, operator_selection, workers
@@ -128,6 +130,77 @@ def test_runs_that_keep_failing_are_given_up_with_the_last_reason(tmp_path: Path
     assert list(grid.run(two, tmp_path, str(tmp_path)))[-1] == (1, 3)  # the other one is trained
     assert grid.given_up(study, two.cells) == {GRID.cells[0]: "reason 2"}
     assert grid.given_up(study, [two.cells[1]]) == {}
+
+
+def test_deaths_of_workers_are_not_the_runs_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It goes on from its checkpoint each time; but what kills every worker ends somewhere."""
+    monkeypatch.setattr(grid, "WorkerPool", SameProcess)
+    monkeypatch.setattr(grid, "Objective", Stub)
+    monkeypatch.setattr(grid, "POLL_SECONDS", 0.0)
+    study = make_study(tmp_path)
+    dead = optuna.trial.create_trial(
+        state=TrialState.FAIL, user_attrs=GRID.cells[0]._asdict() | {"reason": "its worker died", workers.DIED_KEY: True}
+    )
+    study.add_trials([dead] * (grid.MAX_DEATHS - 1))
+    assert list(grid.run(GRID, tmp_path, str(tmp_path)))[-1] == (1, grid.MAX_DEATHS - 1)
+    other = replace(GRID, name="other")
+    study = optuna.create_study(study_name="other", storage=open_storage(tmp_path), direction="maximize")
+    study.add_trials([dead] * grid.MAX_DEATHS)
+    assert list(grid.run(other, tmp_path, str(tmp_path)))[-1] == (0, grid.MAX_DEATHS)
+    assert grid.given_up(study, GRID.cells) == {GRID.cells[0]: "its worker died"}
+
+
+def test_a_worker_that_slept_while_another_program_failed_its_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Sleeper(Stub):
+        slept = 0
+
+        def train(self, trial: optuna.Trial, *arguments: object) -> float:
+            value = super().train(trial)
+            if not Sleeper.slept:
+                Sleeper.slept += 1
+                workers.fail(trial.study, trial.study.trials[trial.number], "no sign of life")
+            return value
+
+    monkeypatch.setattr(grid, "WorkerPool", SameProcess)
+    monkeypatch.setattr(grid, "Objective", Sleeper)
+    monkeypatch.setattr(grid, "POLL_SECONDS", 0.0)
+    two = replace(GRID, seeds=[0, 1])
+    assert list(grid.run(two, tmp_path, str(tmp_path)))[-1] == (2, 1)
+    states = Counter(trial.state for trial in load_study(open_storage(tmp_path), GRID.name).trials)
+    assert states == {TrialState.FAIL: 1, TrialState.COMPLETE: 2}
+
+
+def test_notes_say_what_was_trained_on_which_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grid, "WorkerPool", SameProcess)
+    monkeypatch.setattr(grid, "POLL_SECONDS", 0.0)
+    curl, hyper = catalog.load("curl"), {"learning_starts": 10, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
+    own = replace(GRID, config=replace(CONFIG, evaluation_episodes=1, overrides=hyper))
+    variants = {"CURL": grid.Variant(curl), "SAC": grid.Variant(None), "diverges": grid.Variant(None, {"learning_rate": 1e30})}
+    list(grid.run(replace(own, variants=variants), tmp_path, str(tmp_path)))
+    study = load_study(open_storage(tmp_path), GRID.name)
+    outcomes = Counter((trial.user_attrs["variant"], trial.state) for trial in study.trials)
+    assert outcomes == {
+        ("CURL", TrialState.COMPLETE): 1,
+        ("SAC", TrialState.COMPLETE): 1,
+        ("diverges", TrialState.FAIL): grid.MAX_TRIES,
+    }
+    attrs = study._storage.get_study_system_attrs(study._study_id)
+    note = get_note_from_system_attrs(attrs, None)["body"]
+    assert "Trainings: some\\-grid" in note and "CURL\\, SAC" in note and "learning\\_starts" in note and "commit" in note
+    for trial in study.trials:
+        note = get_note_from_system_attrs(attrs, trial._trial_id)["body"]
+        variant = trial.user_attrs["variant"]
+        assert f"**Variant:** {variant}. **Environment:** dm\\_control\\/cartpole\\-balance\\-v0. **Seed:** 0." in note
+        if variant == "CURL":
+            assert f"Notation: `{curl}`" in note and "latex" in note
+        if trial.state == TrialState.COMPLETE:
+            assert f"**Score:** {trial.value:.2f}" in note and "| 800 |" in note and "![Learning curve]" in note
+        else:
+            assert "**State:** fail" in note and "**Reason:**" in note
+        assert ("No auxiliary loss." in note) == (variant != "CURL")
+    assert len(list((tmp_path / "artifacts").iterdir())) >= 2
 
 
 def test_variants_are_compared_that_have_all_runs_that_any_has() -> None:

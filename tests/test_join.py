@@ -1,6 +1,8 @@
 """Workers that join a search: all they need is in its storage."""
 
+import contextlib
 import signal
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,6 +104,31 @@ def test_a_study_whose_name_is_a_path_writes_nothing_elsewhere(tmp_path: Path) -
     with pytest.raises(ValueError, match="another kind"):
         evolve.stored_config(study, tmp_path / "folder")
     assert not list(tmp_path.rglob("*evil*"))
+
+
+def test_a_study_called_like_the_folder_above_writes_nothing_there(tmp_path: Path) -> None:
+    study = optuna.create_study(study_name="..")
+    study.set_user_attr(evolve.CONFIG_KEY, {"...yml": TINY, "..-hyperparameters.yml": HYPERPARAMETERS})
+    with pytest.raises(ValueError, match="another kind"):
+        evolve.stored_config(study, tmp_path / "runs" / "..")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_worker_waits_for_the_configuration_of_a_study_that_is_being_begun(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = str(tmp_path / "run")
+    study = optuna.create_study(study_name="tiny", storage=evolve.open_storage(where), direction="maximize")
+    monkeypatch.setattr(evolve, "WAIT_SECONDS", 0.2)
+    begun = threading.Timer(1.0, evolve.keep_config, (study, load_config(config)))
+    begun.start()
+    progress = next(evolve.join(where, "tiny", tmp_path / "elsewhere", lambda *_: contextlib.nullcontext(), wait=30))
+    assert [stage.places for stage in progress.stages] == [4, 4]
+    begun.join()
+    empty = str(tmp_path / "empty")
+    optuna.create_study(study_name="tiny", storage=evolve.open_storage(empty), direction="maximize")
+    with pytest.raises(ValueError, match="has no configuration"):
+        next(evolve.join(empty, "tiny", tmp_path / "elsewhere", lambda *_: contextlib.nullcontext(), wait=0.5))
 
 
 def test_workers_need_nothing_but_the_storage(config: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from optuna.samplers import RandomSampler
 from optuna.storages import RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, TrialState
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_aarl import AuxLoss, SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve
@@ -268,6 +268,62 @@ def test_an_interruption_stays_one_where_the_processes_of_environments_are_gone(
         env.processes[0].kill()
         env.processes[0].join()
         raise KeyboardInterrupt
+
+
+def test_the_death_of_an_environments_process_costs_neither_checkpoint_nor_candidate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as by the kernel, when memory runs out: the same candidate goes on from where it was."""
+    hyper = HYPER | {"n_envs": 2, "gradient_steps": -1, "vec_env": "subproc"}
+    undisturbed = train_candidate(ENV, LOSS, hyper, 0, CHECKPOINTS, 1)
+    made: list[VecEnv] = []
+
+    def make(*arguments: Any, **keywords: Any) -> VecEnv:
+        made.append(make_vec_env(*arguments, **keywords))
+        return made[-1]
+
+    def kill(evaluation: Evaluation) -> None:
+        if evaluation.environment_steps == CHECKPOINTS[1]:
+            assert isinstance(made[0], SubprocVecEnv)
+            made[0].processes[0].kill()
+
+    monkeypatch.setattr(training, "make_vec_env", make)
+    with pytest.raises(training.EnvironmentLost, match="process of an environment was killed"):
+        train_candidate(ENV, LOSS, hyper, 0, CHECKPOINTS, 1, tmp_path, kill)
+    assert [path.name for path in (tmp_path / "checkpoint").iterdir()] == [str(CHECKPOINTS[0])]
+    run = train_candidate(ENV, LOSS, hyper, 0, CHECKPOINTS, 1, tmp_path)
+    assert [point[:4] for point in run.curve] == [point[:4] for point in undisturbed.curve]
+
+
+def test_an_environment_that_raises_in_its_process_is_the_candidates_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hyper = HYPER | {"n_envs": 2, "vec_env": "subproc", "env_kwargs": {}}
+    # The other process has not registered it.
+    monkeypatch.setattr(training, "make_env", lambda env_id, env_kwargs: Broken())
+    with pytest.raises(TrainingError) as error:
+        train_candidate("Broken-raise-v0", LOSS, hyper, 0, [20, 100], 1, tmp_path)
+    assert not isinstance(error.value, training.EnvironmentLost)
+    assert not (tmp_path / "checkpoint").exists()
+
+
+def test_a_candidate_whose_environment_died_is_given_out_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    deaths = iter([True, True, False])
+
+    def train(*arguments: Any, **keywords: Any) -> training.TrainingRun:
+        if next(deaths):
+            raise training.EnvironmentLost("the process of an environment was killed")
+        return training.TrainingRun([Evaluation(800, 1.0, 0.0, 1, 0.0)], 1.0)
+
+    monkeypatch.setattr("search.objective.train_candidate", train)
+    objective = make_objective(tmp_path)
+    study = optuna.create_study(
+        direction="maximize", sampler=AuxLossSampler(n_random=1, n_prior=0, n_stages=1, max_horizon=2, seed=0)
+    )
+    study.optimize(objective, n_trials=3, catch=CandidateFailed)
+    assert [trial.state for trial in study.trials] == [TrialState.FAIL, TrialState.FAIL, TrialState.COMPLETE]
+    assert len({trial.user_attrs["loss"] for trial in study.trials}) == 1
+    assert study.trials[0].user_attrs["reason"] == "the process of an environment was killed"
 
 
 def test_several_environments_go_on_after_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

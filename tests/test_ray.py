@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import optuna
+import psutil
 import pytest
 import torch as th
 from optuna.trial import TrialState
@@ -210,6 +211,19 @@ def test_a_storage_of_this_machine_is_refused_when_nodes_are_on_others(
     with pytest.raises(ValueError, match=r"there 10\.0\.0\.2.*--storage postgresql://") as refusal:
         check_storage(where)
     assert where in str(refusal.value)
+
+
+def test_the_cluster_is_not_told_a_password(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray shows everybody the command line of who has joined."""
+    told = []
+    monkeypatch.setattr(
+        psutil.Process, "cmdline", lambda process: ["aarl", "search", "--storage", "postgresql://me:secret@host/db"]
+    )
+    monkeypatch.setattr(ray, "init", lambda **arguments: told.append(ray._private.utils.get_entrypoint_name()))
+    before = ray._private.utils.get_entrypoint_name
+    ray_launcher._init(address="auto")
+    assert told == ["aarl search --storage postgresql://me:***@host/db"]
+    assert ray._private.utils.get_entrypoint_name is before
 
 
 def say(folder: Path) -> None:

@@ -231,13 +231,14 @@ def test_what_other_studies_of_the_storage_add(study, tmp_path):
 
 
 def test_settings_are_those_that_the_study_has_noted(study, tmp_path):
-    noted = {"environment": "Pendulum-v1", "checkpoints": [2000, 40000], "evaluation_episodes": 3}
+    noted = {"environment": "Pendulum-v1", "checkpoints": [2000, 40000], "evaluation_episodes": 3, "seeds": [0, 1]}
     study.set_user_attr("training", {"candidates": noted})
     write_report(study, tmp_path / "report.html")
     page = read_page(tmp_path / "report.html")
     assert ["checkpoints", "[2000, 40000]"] in table_after(page, "Settings")
     text = " ".join(page.text_content().split())
     assert "trained on Pendulum-v1 and evaluated at 2,000, 40,000 environment steps with 3 episodes." in text
+    assert "mean of 2 trainings" in text
 
 
 @pytest.mark.parametrize("curves", [{}, {"curve": [[1, 1.0, 0.0]]}])

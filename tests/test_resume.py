@@ -450,6 +450,23 @@ def test_without_a_key_trainings_keep_no_checkpoints(
     assert "No checkpoints are kept" in line and str(path) in line and reason in line
 
 
+def test_a_checkpoint_waits_for_the_key_that_it_was_signed_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A home that is away for a moment says nothing about a checkpoint."""
+    key = tmp_path / "key"
+    monkeypatch.setenv(checkpoint.KEY_VARIABLE, str(key))
+    arguments = arguments_of("pendulum", tmp_path / "run", checkpoints=[10, 20, 30])
+    (saved,) = (interrupted(arguments) / "checkpoint").iterdir()
+    key.chmod(0o644)
+    checkpoint._key.cache_clear()  # as in another process
+    with pytest.raises(PermissionError, match=f"{saved} cannot be read without the key in {key}"):
+        train_candidate(**arguments)
+    key.chmod(0o600)
+    checkpoint._key.cache_clear()
+    begun = begins(monkeypatch)
+    train_candidate(**arguments)
+    assert begun == [20]
+
+
 # Full disks.
 
 

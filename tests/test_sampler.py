@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import sys
 import threading
 import time
 from collections import Counter
@@ -20,6 +21,7 @@ from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_s
 from optuna.trial import FrozenTrial, TrialState
 from search_worker import SETTINGS, DivergedError, diverges, open_storage, score, work
 
+import search.storage
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from search import sampler as module
 from search import workers
@@ -505,6 +507,75 @@ def test_a_trial_that_never_chooses_is_given_up(monkeypatch: pytest.MonkeyPatch)
     assert study.trials[0]._trial_id == orphan
     assert study.trials[0].state == TrialState.FAIL
     assert "died" in study.trials[0].user_attrs["reason"]
+
+
+def test_a_worker_shows_that_it_lives_before_it_shows_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed in between on another machine, its trial would have a name and no sign: nobody could say that it died."""
+    done = []
+    monkeypatch.setattr(workers, "beat", lambda *arguments: done.append("sign"))
+    monkeypatch.setattr(module, "_show", lambda study, trial, key, value: done.append(key))
+    study = make_study(storage=search.storage.open_storage(tmp_path))
+    study.optimize(lambda trial: score(suggest_aux_loss(trial, 2)), n_trials=1)
+    assert done[:2] == ["sign", workers.WORKER_KEY]
+
+
+def test_parents_of_a_stage_are_those_of_now() -> None:
+    """Optuna's own get_parent_population would keep what it found while the stage was still open."""
+    study = make_study()
+    sampler = study.sampler
+    assert isinstance(sampler, AuxLossSampler)
+    for n_trials in (3, 9, 1):
+        study.optimize(lambda trial: score(suggest_aux_loss(trial, 2)), n_trials=n_trials)
+        assert sampler.get_parent_population(study, 0) == []
+        parents = sampler.get_parent_population(study, 1)
+        assert [trial.number for trial in parents] == [trial.number for trial in sampler.select_parent(study, 1)]
+    of_stage = [trial for trial in placed(study) if trial.user_attrs["stage"] == 1]
+    best = sorted(of_stage, key=lambda trial: (-trial.value, trial.user_attrs["place"]))
+    assert [trial.number for trial in parents] == [trial.number for trial in best[: len(parents)]]
+    assert sampler.get_parent_population(study, 7) == []
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_known_of_places_is_what_the_trials_say(seed: int) -> None:
+    """However they end, and whatever is enqueued between them."""
+    rng = np.random.default_rng(seed)
+    study = make_study(n_stages=3, retries=1)
+    sampler = study.sampler
+    assert isinstance(sampler, AuxLossSampler)
+    running: list[optuna.Trial] = []
+    with pytest.raises(SearchComplete):
+        while True:
+            if rng.random() < 0.1:
+                study.enqueue_trial(loss_to_params(AuxLoss.parse("{s_t} -> {s_t+1}")))
+            if len(running) < 3 and sampler.has_place(study):
+                running.append(study.ask())
+                suggest_aux_loss(running[-1], 2)
+            else:
+                trial = running.pop(rng.integers(len(running)))
+                how = rng.choice(["complete", "prune", "fail", "die"], p=[0.6, 0.1, 0.2, 0.1])
+                if how == "die":
+                    workers.fail(study, study.trials[trial.number], "its worker died")
+                else:
+                    state = {"complete": None, "prune": TrialState.PRUNED, "fail": TrialState.FAIL}[how]
+                    study.tell(trial, rng.random() if how == "complete" else None, state=state)
+            sampler.progress(study)
+            register = sampler._register
+            for stage in range(1, 4):
+                holders = {place: register.held_by(stage, place) for place in range(len(sampler.operations(stage)))}
+                assert register.taken[stage] == {place for place, trials in holders.items() if trials}
+                filled = {place for place, trials in holders.items() if trials and trials[0].state in module.FILLED}
+                assert register.filled[stage] == filled
+
+
+def test_a_score_that_cannot_be_squared_does_not_stop_a_screened_search() -> None:
+    def objective(trial: optuna.Trial) -> float:
+        value = score(suggest_aux_loss(trial, 2))
+        return -sys.float_info.max if trial.number % 5 == 0 else value
+
+    study = make_study(screening=3, n_stages=3)
+    with pytest.raises(SearchComplete):
+        study.optimize(objective)
+    assert filled_places(study) == all_places(12, 12, 3)
 
 
 def test_trials_of_other_samplers_are_left_alone() -> None:

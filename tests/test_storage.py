@@ -1,14 +1,20 @@
 """Storages: what a kill leaves behind in a journal, files of strangers, and passwords that nobody may read."""
 
 import sqlite3
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import optuna
 import pytest
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from typer.testing import CliRunner
 
 from search import provenance
-from search.storage import JOURNAL, open_storage, without_password
+from search import storage as storage_module
+from search.cli import app
+from search.storage import JOURNAL, open_storage, storage_name, without_password
 
 
 @pytest.mark.parametrize("kept", [1, 40, -1], ids=str)
@@ -121,6 +127,8 @@ def test_a_folder_may_be_called_like_a_database(tmp_path: Path, monkeypatch: pyt
         ("PGPASSWORD=secret aarl", "PGPASSWORD=*** aarl"),
         ("postgresql:/me:secret@host", "postgresql:/me:***@host"),
         ("grpc://127.0.0.1:13000", "grpc://127.0.0.1:13000"),
+        ("postgresql://me@corp:secret@host/db", "postgresql://me@corp:***@host/db"),
+        ("postgresql://DOMAIN/me:secret@host/db", "postgresql://DOMAIN/me:***@host/db"),
         ("http://localhost:8080/a@b", "http://localhost:***@b"),  # rather too much
     ],
 )
@@ -128,6 +136,85 @@ def test_passwords_are_left_out(text: str, shown: str) -> None:
     assert without_password(text) == shown
 
 
+@pytest.mark.parametrize(
+    ("where", "shown"),
+    [
+        ("postgresql://me:my secret@host/db", "postgresql://me:***@host/db"),
+        ("postgresql://me:secret/db", "postgresql://***"),  # no host: what stands for its port is a password
+        ("postgresql://me:sec[ret/db", "postgresql://***"),
+        ("postgresql://host:5432/db", "postgresql://host:5432/db"),
+        ("grpc://host:port", "grpc://host:port"),
+        ("runs/a b", "runs/a b"),
+        ("--storage=postgresql://me:my secret@host/db", "--storage=postgresql://me:***@host/db"),
+    ],
+)
+def test_a_storage_is_named_without_its_password(where: str, shown: str) -> None:
+    assert storage_name(where) == shown
+
+
+@pytest.mark.parametrize("where", ["postgresql://me:my s3cret@host/db", "postgresql://me:s3cret/db"])
+def test_a_password_in_a_url_with_an_error_is_not_shown(where: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yml").write_text("environment: Pendulum-v1\nhyperparameters: h.yml\ncheckpoints: [40]\n")
+    (tmp_path / "h.yml").write_text("default: {policy: MlpPolicy}\n")
+    for command in (["search", str(tmp_path / "a.yml"), "--folder", str(tmp_path / "run")], ["worker"]):
+        result = CliRunner().invoke(app, [*command, "--storage", where])
+        assert result.exit_code != 0 and "malformed URL" in result.output
+        assert "s3cret" not in result.output
+
+
 def test_the_command_in_notes_and_reports_has_no_password(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["/bin/aarl", "search", "a.yml", "--storage", "postgresql://me:secret@host/db"])
+    monkeypatch.setattr("sys.argv", ["/bin/aarl", "search", "a.yml", "--storage", "postgresql://me:se cret@host/db"])
     assert provenance.provenance()["command"] == "aarl search a.yml --storage postgresql://me:***@host/db"
+
+
+class Clock:
+    """Time that goes on when it is told to."""
+
+    now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.mark.parametrize(
+    ("interval", "look_every", "seconds"),
+    [(60, 1.0, 120), (60, 59.0, 236), (1, 0.4, 2), (1, 1.02, 5.1), (2, 5.0, 25), (5, 9.0, 45)],
+)
+def test_a_sign_that_does_not_change_is_noticed_however_slowly_this_process_looks(
+    interval: float, look_every: float, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(storage_module, "time", clock)
+    watch, began = storage_module._Watch(interval), clock.now
+    while watch.unchanged(lambda: {1: "sign"}).get(1, ("sign", 0.0))[1] < 2 * interval:
+        clock.now += look_every
+        assert clock.now - began < 10 * seconds
+    assert clock.now - began <= seconds + look_every
+
+
+@pytest.mark.parametrize(("interval", "away"), [(60, 61.0), (60, 600.0), (1, 11.0)])
+def test_after_a_time_in_which_nobody_looked_watching_begins_anew(
+    interval: float, away: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(storage_module, "time", clock)
+    watch = storage_module._Watch(interval)
+    for _ in range(3):
+        watch.unchanged(lambda: {1: "sign"})
+        clock.now += 0.4 * interval
+    assert watch.unchanged(lambda: {1: "sign"})[1][1] > interval
+    clock.now += away
+    assert watch.unchanged(lambda: {1: "sign"}) == {1: ("sign", 0.0)}
+
+
+def test_a_plain_journal_of_optuna_and_ours_write_one_file(tmp_path: Path) -> None:
+    """A notebook, or the dashboard of somebody who knows nothing of this package."""
+    ours = optuna.create_study(study_name="study", storage=open_storage(tmp_path))
+    plain = optuna.load_study(study_name="study", storage=JournalStorage(JournalFileBackend(str(tmp_path / JOURNAL))))
+    began = time.monotonic()
+    for number in range(10):
+        for study in (ours, plain):
+            study.tell(study.ask(), number)
+    assert time.monotonic() - began < 10  # Optuna's own lock would wait 30 seconds for a file that it takes for a lock
+    for study in (ours, plain):
+        assert [trial.value for trial in study.trials] == [number for number in range(10) for _ in range(2)]
