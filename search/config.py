@@ -508,15 +508,15 @@ _ARGUMENTS = {
 
 
 def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str) -> dict[str, Any]:
-    def check(mapping: dict[str, Any], key: str, hints: Mapping[str, Any], within: str = "") -> None:
-        if mapping.get(key) is not None:
-            mapping[key] = _mapping(mapping[key], hints, f"{where}: {within}{key}", Path())
-
     checked = _mapping(dict(values), _ARGUMENTS, where, Path())
     make = make_dmc_env if env_id.startswith(PREFIX) else wrap_env
-    check(checked, "env_kwargs", _arguments(make, without=("env_id", "env", "seed")))
-    check(checked, "replay_buffer_kwargs", _BUFFER_ARGUMENTS)
-    check(checked, "policy_kwargs", _POLICY_ARGUMENTS)
+    for key, hints in (
+        ("env_kwargs", _arguments(make, without=("env_id", "env", "seed"))),
+        ("policy_kwargs", _POLICY_ARGUMENTS),
+        ("replay_buffer_kwargs", _BUFFER_ARGUMENTS),
+    ):
+        if checked.get(key) is not None:
+            checked[key] = _mapping(checked[key], hints, f"{where}: {key}", Path())
     if checked.get("aux_loss") not in (None, "auto"):
         _convert(values["aux_loss"], AuxLoss, f"{where}: aux_loss", Path())
         checked["aux_loss"] = None if values["aux_loss"] == "none" else values["aux_loss"]
@@ -534,8 +534,12 @@ def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str)
         encoder = encoder_class(policy_kwargs.get("features_extractor_class") or policy.default_encoder)
     except ValueError as error:
         raise ConfigError(f"{where}: policy_kwargs: {error}") from None
-    check(policy_kwargs, "features_extractor_kwargs", _arguments(encoder, without=("observation_space",)), "policy_kwargs.")
-    check(policy_kwargs, "optimizer_kwargs", _OPTIMIZER_ARGUMENTS, "policy_kwargs.")
+    for key, hints in (
+        ("features_extractor_kwargs", _arguments(encoder, without=("observation_space",))),
+        ("optimizer_kwargs", _OPTIMIZER_ARGUMENTS),
+    ):
+        if policy_kwargs.get(key) is not None:  # it stays as RL-Zoo reads it: a list is no tuple
+            _mapping(policy_kwargs[key], hints, f"{where}: policy_kwargs.{key}", Path())
     if checked.get("vec_env", "dummy") not in VEC_ENVS:
         raise ConfigError(f"{where}: vec_env must be one of {', '.join(VEC_ENVS)}, not {checked['vec_env']!r}")
     return checked
@@ -575,9 +579,6 @@ def _check(config: SearchConfig, where: str) -> None:
     environments |= {f"{name}.environments": part.environments for name, part in parts.items() if part}
     if config.cross_validation:
         trained = list(dict.fromkeys(env_id for names in environments.values() for env_id in names))
-        for env_id in config.cross_validation.checkpoints:
-            nearest = difflib.get_close_matches(env_id, trained, n=1, cutoff=0.0)
-            check(env_id in trained, f"cross_validation.checkpoints: {env_id!r} is not trained on, nearest: {nearest[0]!r}")
         environments["cross_validation.checkpoints"] = tuple(config.cross_validation.checkpoints)
     for key, env_ids_ in environments.items():
         check(bool(env_ids_) or key.endswith("checkpoints"), f"{key} must name at least one environment")
@@ -588,6 +589,9 @@ def _check(config: SearchConfig, where: str) -> None:
             except ValueError as error:
                 raise ConfigError(f"{where}: {key}: {error}") from None
             check(full == env_id, f"{key}: write {full!r} for {env_id!r}")
+            if key.endswith("checkpoints"):
+                nearest = difflib.get_close_matches(env_id, trained, n=1, cutoff=0.0)
+                check(env_id in trained, f"{key}: {env_id!r} is not trained on, nearest: {nearest[0]!r}")
             baselines = config.baselines if env_id == config.environment else ()
             for overrides in ({}, *(baseline.overrides for baseline in baselines)):
                 settings = config.hyperparameters_for(env_id, overrides)
