@@ -146,9 +146,9 @@ def serve(storage: BaseStorage, artifact_path: str | Path, host: str = "127.0.0.
 
 def _loss_lines(trial: FrozenTrial, loss: AuxLoss | None) -> list[str]:
     # The dashboard shows no HTML in notes, unless it is told to trust all of them with scripts: no MathML there.
-    variant = trial.user_attrs.get("variant")
-    if loss is None and variant is not None:
-        return [f"### {_escape(variant)}", *(["No auxiliary loss."] if trial.user_attrs.get("loss") == "none" else [])]
+    if loss is None and "variant" in trial.user_attrs:
+        none = ["No auxiliary loss."] if trial.user_attrs.get("loss") == "none" else []
+        return [f"### {_escape(trial.user_attrs['variant'])}", *none]
     if loss is None:
         return [f"### Trial {trial.number}", "It has no valid loss."]
     canonical = f"Canonical: `{loss.canonical()}`" if loss.canonical() != loss else "This is its canonical form."

@@ -276,11 +276,9 @@ def _enqueue(study: optuna.Study, cells: Sequence[Cell]) -> int:
     trials = study.get_trials(deepcopy=False)
     there = {_cell_of(trial) for trial in trials if trial.state not in (TrialState.FAIL, TrialState.PRUNED)}
     failed = [trial for trial in trials if trial.state == TrialState.FAIL and not trial.user_attrs.get("interrupted")]
-    died = [trial for trial in failed if workers.DIED_KEY in trial.user_attrs]
-    deaths, tries = Counter(map(_cell_of, died)), Counter(map(_cell_of, failed))
-    missing = [
-        cell for cell in cells if cell not in there and tries[cell] - deaths[cell] < MAX_TRIES and deaths[cell] < MAX_DEATHS
-    ]
+    deaths = Counter(_cell_of(trial) for trial in failed if workers.DIED_KEY in trial.user_attrs)
+    tries = Counter(_cell_of(trial) for trial in failed if workers.DIED_KEY not in trial.user_attrs)
+    missing = [cell for cell in cells if cell not in there and tries[cell] < MAX_TRIES and deaths[cell] < MAX_DEATHS]
     for cell in missing:
         # As attributes: parameters of Optuna could not take a seed more when a grid grows.
         study.enqueue_trial({}, user_attrs=cell._asdict())

@@ -127,7 +127,7 @@ class WorkerPool:
     Some processes that run one function until it returns.
 
     A worker that is killed, politely or not, is started again; one that raises stops the pool, and one that gets Ctrl-C,
-    which all get. Leaving the ``with`` block interrupts those that still run, as Ctrl-C does, so that they can put away
+    which reaches all. Leaving the ``with`` block interrupts those that still run, as Ctrl-C does, so that they can put away
     what they have.
 
     :param target: Function that each worker runs; it returns when nothing is left to do

@@ -249,10 +249,9 @@ class WithHeartbeat(BaseStorage, BaseHeartbeat):
     A storage with signs of life: a system attribute of the trial that changes with each of them.
 
     A trial is stale when its sign has not changed while this process watched for two intervals of the trial's own worker,
-    which the sign names. No clocks are compared,
-    and nobody is blamed for a time in which the server, the network or this process stood still. So somebody has to
-    look once an interval at least, as workers do that wait for a place: as long as none waits, nobody needs the
-    place of a stale trial. Trials without any sign (of a user's own ``ask``) are never stale.
+    which the sign names. No clocks are compared, and nobody is blamed for a time in which the server, the network or this
+    process stood still. So somebody has to look once an interval at least, as workers do that wait for a place: as long as
+    none waits, nobody needs the place of a stale trial. Trials without any sign (of a user's own ``ask``) are never stale.
     """
 
     heartbeat_interval: int = HEARTBEAT_INTERVAL

@@ -341,10 +341,11 @@ class _RunFolder:
         saved = [path for path in self._checkpoints.glob("*") if path.name.isdecimal()]
         if saved:
             newest = max(saved, key=lambda path: int(path.name))
-            if user_key() is None and _holds(newest, self.description):
+            key = user_key()
+            if key is None and _holds(newest, self.description):
                 raise PermissionError(f"{newest} cannot be read without the key in {key_path()}: mend it, or remove the other")
             try:
-                with opened(newest, user_key()) as (files, about):
+                with opened(newest, key) as (files, about):
                     if not _holds(newest, self.description):
                         raise CheckpointError("it belongs to a training with other settings")
                     curve = read_curve(newest / "curve.csv")
