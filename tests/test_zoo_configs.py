@@ -162,7 +162,9 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
         "aarl_state",
         {"precision": "bf16", "policy_kwargs": {"share_features_extractor": False}},
     ),
+    "curl_state_bf16": ("curl_state", {"precision": "bf16"}),
     "sac_dense_mlp_bf16": ("sac_dense_mlp", {"precision": "bf16"}),
+    "sac_identity_bf16": ("sac_identity", {"precision": "bf16"}),
 }
 
 
