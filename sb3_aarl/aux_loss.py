@@ -176,9 +176,10 @@ class AuxLoss:
 
         Windows are drawn uniformly from an episode, so two losses with one canonical form are one loss.
         """
-        chosen = [i for i, bits in enumerate(zip(self.source, self.target, strict=True)) if any(bits)]
-        first = chosen[0] // 3 * 3
-        horizon = max(1, -(-(chosen[-1] - first) // 3))  # state i closes step i, action and reward i lie in step i + 1
+        chosen = [in_source or in_target for in_source, in_target in zip(self.source, self.target, strict=True)]
+        first = chosen.index(True) // 3 * 3
+        last = len(chosen) - 1 - chosen[::-1].index(True)
+        horizon = max(1, -(-(last - first) // 3))  # state i closes step i, action and reward i lie in step i + 1
         if first == 0 and horizon == self.horizon:
             return self
         # A state at the very end, alone, has no step behind it.

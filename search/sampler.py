@@ -474,7 +474,7 @@ class AuxLossSampler(BaseGASampler):
         A loss that the user enqueued takes a random place if there is one: no offspring is lost.
         """
         evolution = self._get_evolution(study)
-        stage = evolution.complete_stages(self._register) + 1
+        stage = evolution.complete_stages() + 1
         if self.n_stages is not None and stage > self.n_stages:
             raise SearchComplete(f"all {self.n_stages} stages of the search are complete")
         free = [(stage, place) for place in self._free(stage)]
@@ -527,7 +527,7 @@ class AuxLossSampler(BaseGASampler):
 
     def _get_evolution(self, study: Study) -> "_Evolution":
         if self._evolution is None:
-            self._evolution = _Evolution(self, self._study_seed(), self._sign(study))
+            self._evolution = _Evolution(self, self._register, self._study_seed(), self._sign(study))
         return self._evolution
 
     def _study_seed(self) -> int:
@@ -654,12 +654,14 @@ class _Evolution:
     Stages are planned place by place in one order, because a candidate must not repeat those before it.
 
     :param sampler: Its settings
+    :param register: Who has which place
     :param seed: Seed of the study
     :param sign: -1 where scores are minimized
     """
 
-    def __init__(self, sampler: AuxLossSampler, seed: int, sign: float):
+    def __init__(self, sampler: AuxLossSampler, register: _Register, seed: int, sign: float):
         self.sampler = sampler
+        self.register = register
         self.seed = seed
         self.sign = sign
         self.plans: defaultdict[int, list[Candidate]] = defaultdict(list)
@@ -671,8 +673,9 @@ class _Evolution:
         self._crossed: list[list[tuple[int, AuxLoss]]] = []
         self._n_seen: dict[int, int] = {}  # how many there were when the random places of a stage were planned
 
-    def complete_stages(self, register: _Register) -> int:
+    def complete_stages(self) -> int:
         """How many stages are complete; takes note of the trials of those that have become so."""
+        register = self.register
         while True:
             stage = len(self._losses) + 1
             if len(register.filled[stage]) < self._size(stage):
@@ -738,8 +741,18 @@ class _Evolution:
         """Plan the first places of a stage, as many as asked for."""
         plan = self.plans[stage]
         while len(plan) < n_places:
-            plan.append(self._draw(stage, len(plan), 0, self.seen))
+            place = len(plan)
+            plan.append(self._given_out(stage, place) or self._draw(stage, place, 0, self.seen))
             self.seen[plan[-1].loss.canonical()] = None
+
+    def _given_out(self, stage: int, place: int) -> Candidate | None:
+        """The first candidate of a place where the storage has it already: another worker, or an earlier run, has drawn it."""
+        for number in self.register.holders.get((stage, place), ()):
+            trial = self.register.trials[number]
+            claim, shown = trial.system_attrs[PLACE_KEY], trial.user_attrs
+            if claim["attempt"] == 0 and claim["loss"] is not None and claim["seed"] == self.seed and "parents" in shown:
+                return Candidate(AuxLoss.parse(claim["loss"]), shown["operation"], tuple(shown["parents"]))
+        return None
 
     def _draw(self, stage: int, place: int, attempt: int, seen: Container[AuxLoss]) -> Candidate:
         rng = np.random.default_rng([self.seed, stage, place, attempt])

@@ -4,11 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from sklearn.linear_model import BayesianRidge
+from threadpoolctl import ThreadpoolController
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
 # Of a score: such as -sys.float_info.max, which stands for a failure.
 LARGEST = 1e100
+# The matrices are too small for threads, which would wait for each other where trainings have the cores.
+BLAS = ThreadpoolController()
 
 
 def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
@@ -52,6 +55,7 @@ class TokenModel:
         self.mean = np.zeros(n_features)
         self.root = np.eye(n_features)
 
+    @BLAS.wrap(limits=1, user_api="blas")
     def add(self, losses: Sequence[AuxLoss], values: Sequence[float]) -> None:
         """
         Add finished trials and fit again.

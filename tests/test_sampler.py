@@ -51,6 +51,12 @@ def run(study: optuna.Study, objective: Callable[[AuxLoss], float] = score) -> o
     return study
 
 
+def failing(loss: AuxLoss) -> float:
+    if diverges(loss):
+        raise DivergedError
+    return score(loss)
+
+
 def placed(study: optuna.Study) -> list[FrozenTrial]:
     return [trial for trial in study.get_trials() if trial.system_attrs.get(PLACE_KEY) is not None]
 
@@ -311,13 +317,37 @@ def test_the_order_in_which_trials_finish_does_not_matter(order: int, screening:
             else:
                 study.tell(trial, score(loss))
     assert filled_places(study) == all_places(12, 12, 3)
-
-    def failing(loss: AuxLoss) -> float:
-        if diverges(loss):
-            raise DivergedError
-        return score(loss)
-
     assert issued(study) == issued(run(make_study(screening=screening), failing))
+
+
+@pytest.mark.parametrize("screening", [1, 3])
+def test_who_goes_on_takes_earlier_candidates_from_the_storage(screening: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def go_on(study: optuna.Study, n_trials: int) -> optuna.Study:
+        study.optimize(lambda trial: failing(suggest_aux_loss(trial, 2)), n_trials=n_trials, catch=(DivergedError,))
+        return study
+
+    drawn: list[tuple[int, int, int]] = []
+    draw = module._Evolution._draw
+
+    def recorded(self: Any, stage: int, place: int, attempt: int, seen: Any) -> module.Candidate:
+        drawn.append((stage, place, attempt))
+        return draw(self, stage, place, attempt, seen)
+
+    study, undisturbed = (make_study(screening=screening) for _ in range(2))
+    enqueued = loss_to_params(AuxLoss.parse("{s_t, a_t} -> {s_t+1}"))
+    for each in (study, undisturbed):
+        each.enqueue_trial(enqueued)
+        go_on(each, 31)
+    study.sampler = make_study(screening=screening, seed=None).sampler  # that of another process
+    before = {key[:2] for key in issued(study) if key[2] == 0}
+    monkeypatch.setattr(module._Evolution, "_draw", recorded)
+    go_on(study, 1)
+    # What is new, and what nobody had because a loss was enqueued.
+    assert (1, 0, 0) in drawn
+    assert not before & {(stage, place) for stage, place, attempt in drawn if attempt == 0}
+    monkeypatch.undo()
+    go_on(undisturbed, 1)
+    assert issued(run(study, failing)) == issued(run(undisturbed, failing))
 
 
 def test_random_numbers_of_anything_else_do_not_matter() -> None:
