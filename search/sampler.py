@@ -498,7 +498,8 @@ class AuxLossSampler(BaseGASampler):
             candidate = evolution.candidate(stage, place, attempt)
             operation, parents, loss = candidate.operation, list(candidate.parents), str(candidate.loss)
         storage, trial_id = study._storage, trial._trial_id
-        claim = {"stage": stage, "place": place, "attempt": attempt, "seed": evolution.seed, "loss": loss}
+        claim: dict[str, Any] = {"stage": stage, "place": place, "attempt": attempt, "seed": evolution.seed, "loss": loss}
+        claim |= {"operation": operation, "parents": parents}
         storage.set_trial_system_attr(trial_id, PLACE_KEY, claim)
         # Others may have seen other trials without a place, and choose the same one at this moment. So everybody looks back,
         # and gives way if he is not alone: one of two, at least, sees the other.
@@ -718,7 +719,7 @@ class _Evolution:
         candidate = self.plans[stage][place]
         if attempt:
             # Not to repeat what is planned, as far as it is known however early this is asked for.
-            is_early = stage > 1 and candidate.operation == "random"
+            is_early = stage > 1 and self.sampler.operations(stage)[place] == "random"
             last = stage if is_early else stage + 1
             self._plan_random(last)
             seen = dict.fromkeys(islice(self.seen, self._n_seen[last]))
@@ -748,10 +749,10 @@ class _Evolution:
     def _given_out(self, stage: int, place: int) -> Candidate | None:
         """The first candidate of a place where the storage has it already: another worker, or an earlier run, has drawn it."""
         for number in self.register.holders.get((stage, place), ()):
-            trial = self.register.trials[number]
-            claim, shown = trial.system_attrs[PLACE_KEY], trial.user_attrs
-            if claim["attempt"] == 0 and claim["loss"] is not None and claim["seed"] == self.seed and "parents" in shown:
-                return Candidate(AuxLoss.parse(claim["loss"]), shown["operation"], tuple(shown["parents"]))
+            claim = self.register.trials[number].system_attrs[PLACE_KEY]
+            # Claims of studies begun before say no parents, and are drawn again.
+            if claim["attempt"] == 0 and claim["loss"] is not None and claim["seed"] == self.seed and "parents" in claim:
+                return Candidate(AuxLoss.parse(claim["loss"]), claim["operation"], tuple(claim["parents"]))
         return None
 
     def _draw(self, stage: int, place: int, attempt: int, seen: Container[AuxLoss]) -> Candidate:

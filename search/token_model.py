@@ -1,5 +1,6 @@
 """A Bayesian linear model of what each token of a loss is worth, for screening offspring before they are trained."""
 
+import threading
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,8 +11,10 @@ from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
 # Of a score: such as -sys.float_info.max, which stands for a failure.
 LARGEST = 1e100
-# The matrices are too small for threads, which would wait for each other where trainings have the cores.
+# The matrices are too small for threads, which would wait for each other where trainings have the cores. The limit is the
+# whole process's: two fits at once might leave it behind.
 BLAS = ThreadpoolController()
+FITTING = threading.Lock()
 
 
 def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
@@ -55,7 +58,6 @@ class TokenModel:
         self.mean = np.zeros(n_features)
         self.root = np.eye(n_features)
 
-    @BLAS.wrap(limits=1, user_api="blas")
     def add(self, losses: Sequence[AuxLoss], values: Sequence[float]) -> None:
         """
         Add finished trials and fit again.
@@ -67,13 +69,14 @@ class TokenModel:
         if not finite.any():
             return
         rows = np.column_stack([features(losses, self.max_horizon), values])[finite]
-        shift = rows.mean(axis=0) - self.means
-        deviations = rows - rows.mean(axis=0)
-        weight = len(rows) / (self.n_trials + len(rows))
-        self.moments += deviations.T @ deviations + self.n_trials * weight * np.outer(shift, shift)
-        self.means += weight * shift
-        self.n_trials += len(rows)
-        self._fit()
+        with FITTING, BLAS.limit(limits=1, user_api="blas"):
+            shift = rows.mean(axis=0) - self.means
+            deviations = rows - rows.mean(axis=0)
+            weight = len(rows) / (self.n_trials + len(rows))
+            self.moments += deviations.T @ deviations + self.n_trials * weight * np.outer(shift, shift)
+            self.means += weight * shift
+            self.n_trials += len(rows)
+            self._fit()
 
     def _fit(self) -> None:
         deviation = np.sqrt(self.moments[-1, -1] / self.n_trials)

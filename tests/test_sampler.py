@@ -350,6 +350,23 @@ def test_who_goes_on_takes_earlier_candidates_from_the_storage(screening: int, m
     assert issued(run(study, failing)) == issued(run(undisturbed, failing))
 
 
+def test_what_objectives_write_on_trials_steers_nothing() -> None:
+    def losses(study: optuna.Study) -> dict[tuple[int, int, int], str]:
+        claims = [trial.system_attrs[PLACE_KEY] for trial in placed(study)]
+        return {(claim["stage"], claim["place"], claim["attempt"]): claim["loss"] for claim in claims}
+
+    def objective(trial: optuna.Trial) -> float:
+        for key, value in {"operation": "mine", "parents": None, "stage": 7}.items():
+            trial.set_user_attr(key, value)
+        return failing(suggest_aux_loss(trial, 2))
+
+    study = make_study()
+    while study.sampler.progress(study) == [] or study.sampler.progress(study)[-1].stage < 3:
+        study.sampler = make_study(seed=None).sampler  # as if each trial had a process of its own
+        study.optimize(objective, n_trials=1, catch=(DivergedError,))
+    assert losses(run(study, failing)) == losses(run(make_study(), failing))
+
+
 def test_random_numbers_of_anything_else_do_not_matter() -> None:
     study = make_study()
     np.random.seed(0)
