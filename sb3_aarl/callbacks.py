@@ -21,7 +21,7 @@ class Evaluation(NamedTuple):
     """
     One point of a learning curve.
 
-    :param environment_steps: Simulator steps that were trained (agent steps x action repeat)
+    :param environment_steps: Environment steps that were trained (agent steps x action repeat)
     :param mean: Mean return of the episodes
     :param std: Standard deviation of their returns
     :param episodes: Number of episodes

@@ -49,7 +49,7 @@ from dm_control import suite  # noqa: E402
 logging.getLogger("absl").addFilter(lambda record: "settotalmass" not in record.getMessage())
 
 PREFIX = "dm_control/"
-# Simulator steps of an episode; only LQR has no time limit of its own.
+# Environment steps of an episode; only LQR has no time limit of its own.
 EPISODE_LENGTH = 1000
 # The camera that papers render a domain with, where it is not the first one (CURL, DrQ-v2: behind the quadruped).
 CAMERAS = {"quadruped": 2}
@@ -97,11 +97,12 @@ def make_dmc_env(
     A task of the DeepMind Control Suite with one float32 vector, or with images, as observation.
 
     ``env.reset(seed=s)`` makes all that follows repeatable. Rewards of repeated steps are summed; an episode has 1000
-    simulator steps ("environment steps" in the paper), so 1000 / action_repeat agent steps, and ends by truncation.
+    environment steps (control steps of the suite, each some steps of MuJoCo), so 1000 / action_repeat agent steps, and ends
+    by truncation.
 
     :param env_id: Such as ``dm_control/cheetah-run-v0``; ``cheetah-run`` and the paper's ``Cheetah-Run`` will do
     :param pixels: Whether to observe rendered images, (3 * frame_stack, height, width) bytes, instead of state vectors
-    :param action_repeat: Simulator steps for which each action is kept
+    :param action_repeat: Environment steps for which each action is kept
     :param frame_stack: Consecutive observations put side by side, the newest last; the first one of an episode fills up
     :param image_size: Height and width in pixels, one number for both
     :param camera_id: Number or name of the camera, None for the usual one of the domain

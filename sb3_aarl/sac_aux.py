@@ -68,7 +68,7 @@ class SACAux(SAC):
     :param train_freq: As in SB3
     :param gradient_steps: As in SB3; -1 for one per transition
     :param action_noise: As in SB3
-    :param replay_buffer_class: None for ``WindowReplayBuffer``; another class can only go without an auxiliary loss
+    :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
     :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is found out from the wrappers unless given
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns, not for Dict observations (as in SB3)
@@ -234,12 +234,13 @@ class SACAux(SAC):
         if self.aux_loss is not None and self.aux_loss != "auto":
             self.aux_loss = catalog.resolve(self.aux_loss)
         # What each argument is called, in case that one of them does not fit.
-        for name in ("policy_delay", "target_update_interval", "crop_size", "aux_batch_size", "predictor_width"):
+        counts = ("buffer_size", "batch_size", "policy_delay", "target_update_interval", "crop_size")
+        for name in (*counts, "aux_batch_size", "predictor_width"):
             if getattr(self, name) is not None and not getattr(self, name) >= 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.aux_coef < float("inf"):
             raise ValueError(f"aux_coef must be a finite number of at least 0, not {self.aux_coef}")
-        for name in ("tau", "encoder_tau"):
+        for name in ("tau", "encoder_tau", "gamma"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
 

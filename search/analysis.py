@@ -249,7 +249,7 @@ def effects(table: pd.DataFrame, by: str | Sequence[str]) -> pd.DataFrame:
     trials = analysed(table)
     groups = trials.groupby(names)["score"]
     group = groups.ngroup()
-    result = pd.DataFrame({"n": groups.size(), "mean": groups.mean(), "std": groups.std(ddof=0), "median": groups.median()})
+    result = pd.DataFrame({"n": groups.size(), "mean": groups.mean(), "std": groups.std(), "median": groups.median()})
     against = [_compare(trials["score"][group == i], trials["score"][group != i]) for i in range(len(result))]
     return result.join(pd.DataFrame(against, index=result.index, columns=["difference", "welch_p", "student_p"], dtype=float))
 

@@ -3,13 +3,13 @@
 import itertools
 import json
 import re
+import reprlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import optuna
 import pandas as pd
 import torch as th
@@ -22,7 +22,7 @@ from search.grid import SCORELESS, Cell, all_cells, check_training
 from search.objective import end_noted, mean_curve
 from search.provenance import provenance
 from search.storage import open_storage
-from search.training import make_env, train_candidate
+from search.training import check_actions, train_candidate
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
@@ -176,8 +176,8 @@ def load_benchmark(
     for stem, count in Counter(path.stem for path in files).items():
         if count > 1:
             raise ConfigError(f"two files are called {stem}: a variant has the name of its file")
-    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
-        raise ConfigError(f"seeds must be different numbers that are not negative, not {list(seeds)}")
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0 or max(seeds) >= 2**32:
+        raise ConfigError(f"seeds must be different numbers from 0 to 2**32 - 1, not {reprlib.repr(list(seeds))}")
     if evaluation_episodes < 1:
         raise ConfigError(f"episodes must be at least 1, not {evaluation_episodes}")
     if every is not None and every < 1:
@@ -185,7 +185,7 @@ def load_benchmark(
     ids = [resolve_env_id(name) for name in environments] or _common_environments(files)
     ids = list(dict.fromkeys(ids))
     for name in ids:
-        _check_actions(name)
+        check_actions(name)
     # SACAux's default, written out: a file that says nothing is not one that says none.
     hyperparameters = {
         path.stem: {name: {"aux_loss": "auto", **load_hyperparameters(path, name)} for name in ids} for path in files
@@ -327,19 +327,6 @@ def _common_environments(files: Iterable[Path]) -> list[str]:
     if not common:
         raise ConfigError("the files have no entry of one environment in common: name environments")
     return [resolve_env_id(name) for name in common]
-
-
-def _check_actions(environment: str) -> None:
-    """Refuse an environment that cannot be made, or whose actions are not continuous. Those of DeepMind Control all are."""
-    if environment.startswith(PREFIX):
-        return
-    try:
-        env = make_env(environment, {})
-    except Exception as error:  # whatever an environment of somebody's own does
-        raise ConfigError(f"{environment} cannot be made: {type(error).__name__}: {' '.join(str(error).split())}") from None
-    with env:
-        if not isinstance(env.action_space, gym.spaces.Box):
-            raise ConfigError(f"{environment} has no continuous actions, which SACAux needs, but {env.action_space}")
 
 
 def _checkpoints(

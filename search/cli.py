@@ -101,13 +101,15 @@ def train(
     with clear_errors():
         from search.training import train_and_keep
 
-        run, folder = train_and_keep(env, aux_loss, config, steps, evaluations, episodes, seed, out)
+        run, folder, was_finished = train_and_keep(env, aux_loss, config, steps, evaluations, episodes, seed, out)
         table = Table("environment steps", "mean return", "deviation", "seconds", title=f"AULC {run.aulc:.1f}")
         for column in table.columns:
             column.justify = "right"
         for point in run.curve:
             table.add_row(f"{point.environment_steps:,}", f"{point.mean:.1f}", f"{point.std:.1f}", f"{point.seconds:.0f}")
         console.print(table)
+        if was_finished:
+            console.print("This training was finished before: it trains again in another folder (--out).", soft_wrap=True)
         console.print(f"Model: {folder / 'model.zip'}\nCurve: {folder / 'curve.csv'}", soft_wrap=True, highlight=False)
 
 
@@ -182,8 +184,12 @@ def search(
     ray_address: Annotated[
         str | None, typer.Option(help="A running Ray cluster: auto, or host:port. Default: a Ray of its own on this machine.")
     ] = None,
-    cpus_per_trial: Annotated[float, typer.Option(help="With Ray: cores of each worker.", min=0)] = 1,
-    gpus_per_trial: Annotated[float, typer.Option(help="With Ray: GPUs of each worker, such as 0.25.", min=0)] = 0,
+    cpus_per_trial: Annotated[
+        float | None, typer.Option(help="With Ray: cores of each worker.", min=0, show_default="1")
+    ] = None,
+    gpus_per_trial: Annotated[
+        float | None, typer.Option(help="With Ray: GPUs of each worker, such as 0.25.", min=0, show_default="0")
+    ] = None,
 ) -> None:
     """Search for losses by evolution. Ctrl-C stops it, the same command goes on with it."""
     with clear_errors():
@@ -199,6 +205,9 @@ def search(
         path = run_folder(config, folder)
         where = storage or str(path)
         launch: Launch | None = None
+        of_ray = {"ray-address": ray_address, "cpus-per-trial": cpus_per_trial, "gpus-per-trial": gpus_per_trial}
+        if launcher != "ray" and (given := [name for name, value in of_ray.items() if value is not None]):
+            raise ValueError(f"--{given[0]} is for workers on a Ray cluster: say --launcher ray too")
         if launcher == "ray" and workers != 0:
             from search.ray_launcher import RayPool
 
@@ -207,8 +216,8 @@ def search(
             launch = partial(
                 RayPool,
                 n_workers=workers,
-                cpus_per_trial=cpus_per_trial,
-                gpus_per_trial=gpus_per_trial,
+                cpus_per_trial=1 if cpus_per_trial is None else cpus_per_trial,
+                gpus_per_trial=gpus_per_trial or 0,
                 address=ray_address,
                 storage=where,
             )
@@ -505,6 +514,12 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
     wide = Console(width=1000)  # as wide as a table is: cut numbers are wrong ones
     for shown in [*tables.score_tables(comparison), *tables.statistics_tables(iqm, better)]:
         wide.print(shown)
+    if (iqm["runs"] < 4).any():
+        console.print(
+            "The interquartile mean of fewer than four runs is their mean, and its interval goes from the smallest to the "
+            "largest.",
+            highlight=False,
+        )
     if comparison["paper_mean"].notna().any():
         console.print(
             f"Paper: table {number}. ▲ ▼: the difference from it is more than two standard errors of the difference, "

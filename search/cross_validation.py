@@ -1,5 +1,6 @@
 """Cross-validation of a search's best candidates (paper, A.4): the best on one environment may have overfitted to it."""
 
+import logging
 from pathlib import Path
 
 import optuna
@@ -10,6 +11,8 @@ from sb3_aarl.aux_loss import AuxLoss
 from search.config import ConfigError, SearchConfig
 from search.grid import Grid, Variant
 from search.trials import loss_of, ranked
+
+logger = logging.getLogger(__name__)
 
 
 def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
@@ -41,6 +44,12 @@ def make_grid(config: SearchConfig, study: optuna.Study, top: int | None = None)
     section = config.cross_validation
     if section is None:
         raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
+    if config.environment in section.environments and (own := sorted({*config.seeds} & {*section.seeds})):
+        logger.warning(
+            "cross_validation.seeds has %s, as the search on %s: the scores that candidates were chosen for count again",
+            ", ".join(map(str, own)),
+            config.environment,
+        )
     losses = top_losses(study, section.top if top is None else top)
     variants = {str(loss): Variant(loss) for loss in losses}
     return Grid(f"{study.study_name}-cross-validation", config, variants, section.environments, section.seeds)
@@ -51,12 +60,13 @@ def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     The candidates by their mean AULC over all environments (paper, A.4), the best first.
 
     :param runs: As :func:`search.grid.scores` gives them
-    :return: One row a candidate: mean score on each environment, then ``mean``, ``std`` over all runs, and ``runs``
+    :return: One row a candidate: mean score on each environment, then ``mean`` and sample deviation
+        ``std`` over all runs, and ``runs``
     """
     by_environment = runs.pivot_table(index="variant", columns="environment", values="score", aggfunc="mean")
     by_variant = runs.groupby("variant")["score"]
     # The mean of the environments' means: each counts alike, however many seeds it has so far.
-    overall = pd.DataFrame({"mean": by_environment.mean(axis=1), "std": by_variant.std(ddof=0), "runs": by_variant.count()})
+    overall = pd.DataFrame({"mean": by_environment.mean(axis=1), "std": by_variant.std(), "runs": by_variant.count()})
     return by_environment.join(overall).sort_values("mean", ascending=False)
 
 

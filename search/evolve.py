@@ -23,6 +23,7 @@ from search.pool import Pool, uninterrupted
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
 from search.storage import HEARTBEAT_INTERVAL, PATIENCE, Outlasting, ServerLost, load_study, open_storage
+from search.training import check_actions
 from search.trials import loss_of, ranked
 
 logger = logging.getLogger(__name__)
@@ -232,6 +233,7 @@ def search(
         long has died
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    check_actions(config.environment)
     storage = open_storage(where)
     sampler = AuxLossSampler(**config.sampler_settings())
     study = optuna.create_study(

@@ -23,6 +23,7 @@ from search.objective import CandidateFailed, DiskError, Objective, disk_problem
 from search.pool import WorkerPool, uninterrupted
 from search.provenance import provenance
 from search.storage import PATIENCE, open_storage, study_id
+from search.training import check_actions
 
 # How often a run is tried that fails, and one whose worker dies: it goes on from its checkpoint.
 MAX_TRIES = 3
@@ -197,6 +198,8 @@ def run(grid: Runs, folder: Path, where: str, n_workers: int = 1, threads: int |
     :param threads: Threads of each, None for its share of the cores
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    for environment in dict.fromkeys(cell.environment for cell in grid.cells):
+        check_actions(environment)
     storage = open_storage(where)
     study = optuna.create_study(study_name=grid.name, storage=storage, direction="maximize", load_if_exists=True)
     check_training(study, grid.trainings)

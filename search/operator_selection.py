@@ -32,7 +32,7 @@ def make_grid(config: SearchConfig) -> Grid:
 
 def table(runs: pd.DataFrame) -> pd.DataFrame:
     """
-    The paper's table 2: mean and standard deviation of normalized returns over all environments and seeds.
+    The paper's table 2: mean and sample deviation of normalized returns over all environments and seeds.
 
     The paper does not say how returns are normalized. Here each is divided by the size of the mean of all operators on
     its environment, so that environments count alike and higher is better even if returns are negative, and then all by
@@ -43,7 +43,7 @@ def table(runs: pd.DataFrame) -> pd.DataFrame:
     """
     scale = runs.groupby("environment")["last"].transform("mean").abs()
     normalized = (runs["last"] / scale.where(scale != 0, 1.0)).groupby(runs["variant"])
-    result = pd.DataFrame({"mean": normalized.mean(), "std": normalized.std(ddof=0), "runs": normalized.count()})
+    result = pd.DataFrame({"mean": normalized.mean(), "std": normalized.std(), "runs": normalized.count()})
     best = result["mean"].max()
     if best > 0:
         result[["mean", "std"]] /= best

@@ -193,7 +193,7 @@ def _is_comparable(comparison: pd.DataFrame) -> bool:
 
 def _by_task(runs: pd.DataFrame) -> pd.DataFrame:
     grouped = runs.groupby(["checkpoint", "environment", "variant"], sort=False)["mean"]
-    summary = {"asked": grouped.size(), "runs": grouped.count(), "mean": grouped.mean(), "std": grouped.std(ddof=1)}
+    summary = {"asked": grouped.size(), "runs": grouped.count(), "mean": grouped.mean(), "std": grouped.std()}
     return pd.DataFrame(summary).reset_index()
 
 
@@ -204,11 +204,8 @@ def _normalized(runs: pd.DataFrame) -> pd.DataFrame:
         there = all_of.groupby("variant", sort=False)["mean"].count()
         complete = comparable(all_of.dropna(subset="mean")).rename(columns={"mean": "last"})
         n_asked = len(all_of[["environment", "seed"]].drop_duplicates())
-        table = (
-            operator_selection.table(complete).reindex(there.index).assign(runs=there, asked=n_asked, checkpoint=checkpoint)
-        )
-        # It gives the deviation of the population.
-        table["std"] *= np.sqrt(table["runs"] / (table["runs"] - 1).where(table["runs"] > 1))
+        table = operator_selection.table(complete).reindex(there.index)
+        table = table.assign(runs=there, asked=n_asked, checkpoint=checkpoint)
         parts.append(table.reset_index().assign(environment=NORMALIZED))
     return pd.concat(parts, ignore_index=True)
 

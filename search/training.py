@@ -27,7 +27,7 @@ from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
 from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
 from search.checkpoint import CheckpointError, ResumableEnv, is_disk_error, key_path, opened, seal, sync_folder, user_key
-from search.config import VEC_ENVS, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
+from search.config import VEC_ENVS, ConfigError, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +36,7 @@ logger = logging.getLogger(__name__)
 EVALUATION_SEED = 10_000
 EVALUATION_SEEDS = 1_000_000
 HALF = 2**31
+MODEL = "model.zip"
 UNFINISHED = "unfinished-"  # name of a checkpoint that is being written
 
 
@@ -80,6 +81,24 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any]) -> gym.Env:
     if env_id.startswith(PREFIX):
         return make_dmc_env(env_id, **env_kwargs)
     return wrap_env(gym.make(env_id, render_mode="rgb_array" if env_kwargs.get("pixels") else None), **env_kwargs)
+
+
+def check_actions(env_id: str) -> None:
+    """
+    Refuse an environment that cannot be made, or whose actions are not continuous. Those of DeepMind Control all are.
+
+    :param env_id: Id of the environment
+    :raises ConfigError: saying why
+    """
+    if env_id.startswith(PREFIX):
+        return
+    try:
+        env = make_env(env_id, {})
+    except Exception as error:  # whatever an environment of somebody's own does
+        raise ConfigError(f"{env_id} cannot be made: {type(error).__name__}: {' '.join(str(error).split())}") from None
+    with env:
+        if not isinstance(env.action_space, gym.spaces.Box):
+            raise ConfigError(f"{env_id} has no continuous actions, which SACAux needs, but {env.action_space}")
 
 
 def spread_checkpoints(environment_steps: int, n_evaluations: int, action_repeat: int = 1) -> tuple[int, ...]:
@@ -222,7 +241,7 @@ def train_and_keep(
     evaluation_episodes: int = 10,
     seed: int = 0,
     folder: str | Path | None = None,
-) -> tuple[TrainingRun, Path]:
+) -> tuple[TrainingRun, Path, bool]:
     """
     Train with one loss and keep the model, with a progress bar.
 
@@ -235,7 +254,7 @@ def train_and_keep(
     :param evaluation_episodes: Episodes of each
     :param seed: Seed of the training
     :param folder: Where model and curve are kept, None for a folder in ``runs`` named after environment, loss and seed
-    :return: The training, and its folder
+    :return: The training, its folder, and whether it was finished before and read from there
     :raises ValueError: when something is unknown or does not fit
     :raises TrainingError: when the training fails while it runs
     """
@@ -251,11 +270,13 @@ def train_and_keep(
             raise ValueError(f"how many steps? {config} has no n_timesteps for {environment}")
         environment_steps = hyperparameters["n_timesteps"] * repeat
     checkpoints = spread_checkpoints(environment_steps, n_evaluations, repeat)
+    check_actions(environment)
     if folder is None:
         # A notation may be longer than a file's name may be.
         label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {aux_loss or 'auto'}".lower())[:80].strip("-")
         settings = f"{loss} {hyperparameters} {checkpoints} {evaluation_episodes}"
         folder = Path("runs") / f"{label}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}-seed-{seed}"
+    was_finished = (Path(folder) / MODEL).exists()  # of another training: train_candidate refuses the folder
     run = train_candidate(
         environment,
         loss,
@@ -267,7 +288,7 @@ def train_and_keep(
         keep_model=True,
         progress_bar=True,
     )
-    return run, Path(folder)
+    return run, Path(folder), was_finished
 
 
 @contextlib.contextmanager
@@ -323,7 +344,7 @@ class _RunFolder:
         self.folder = folder
         self.seed = seed
         self.curve_path = folder / "curve.csv"
-        self.model_path = folder / "model.zip"
+        self.model_path = folder / MODEL
         self._checkpoints = folder / "checkpoint"
 
     def finished_curve(self, checkpoints: Sequence[int], with_model: bool) -> list[Evaluation] | None:
@@ -349,7 +370,7 @@ class _RunFolder:
                     if not _holds(newest, self.description):
                         raise CheckpointError("it belongs to a training with other settings")
                     curve = read_curve(newest / "curve.csv")
-                    model = SACAux.load(files["model.zip"], env, device=device, force_reset=False)
+                    model = SACAux.load(files[MODEL], env, device=device, force_reset=False)
                     model.load_replay_buffer(files["replay_buffer.pkl"])
                     cut_off = about["cut_off"] or _load_simulations(env, pickle.load(files["environments.pkl"]))
             except (OSError, EOFError):
@@ -385,7 +406,7 @@ class _RunFolder:
         env = model.get_env()
         assert env is not None
         try:
-            _save_model(model, unfinished / "model.zip")
+            _save_model(model, unfinished / MODEL)
             with (unfinished / "replay_buffer.pkl").open("wb") as file:
                 model.save_replay_buffer(file)
             states = env.env_method("dump_state")

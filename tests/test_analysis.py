@@ -243,7 +243,7 @@ def test_effects_are_those_of_groups_against_the_rest():
             ]
             own, rest = np.array(scores)[member], np.array(scores)[~np.array(member)]
             assert row["n"] == len(own)
-            statistics = (own.mean(), own.std(), np.median(own), own.mean() - rest.mean())
+            statistics = (own.mean(), own.std(ddof=1), np.median(own), own.mean() - rest.mean())
             np.testing.assert_allclose(row[["mean", "std", "median", "difference"]].astype(float), statistics)
             p_value = scipy.stats.ttest_ind(own, rest, equal_var=False).pvalue
             np.testing.assert_allclose(row["welch_p"], p_value, rtol=1e-9)

@@ -104,7 +104,8 @@ def test_without_options_the_zoo_makes_the_papers_tables(number: int, variants: 
         ("mine.yml --checkpoints 3x", "environment steps are written like 100k, 1M or 20000, not '3x'"),
         ("mine.yml --checkpoints 300 --every 0", "every must be at least 1, not 0"),
         ("mine.yml --checkpoints 300 --seeds 3-1", "seeds are written like 0-9 or 0,3,5, not '3-1'"),
-        ("mine.yml --checkpoints 300 --seeds 1,1", "seeds must be different numbers that are not negative, not [1, 1]"),
+        ("mine.yml --checkpoints 300 --seeds 1,1", "seeds must be different numbers from 0 to 2**32 - 1, not [1, 1]"),
+        ("mine.yml --checkpoints 300 --seeds 5000000000", "seeds must be different numbers from 0 to 2**32 - 1"),
         ("default.yml --envs reacher-easy --checkpoints 302", "at multiples of its action repeat 4, not 302"),
         ("default.yml --envs reacher-easy --checkpoints 304 --every 6", "at multiples of its action repeat 4, not 6"),
     ],
@@ -224,6 +225,7 @@ def test_killed_and_gone_on_with_it_is_what_it_would_have_been(folder: Path) -> 
     for variant in ("mine", "plain"):
         of_variant = [mean for cell in cells for mean in means[cell] if cell.variant == variant]
         assert re.search(rf"{np.mean(of_variant):.1f} ± {np.std(of_variant, ddof=1):.1f}", result.stdout)
+    assert "The interquartile mean of fewer than four runs is their mean" in " ".join(result.stdout.split())
     assert runner.invoke(app, ["table", "out"]).stdout == result.stdout.partition("4/4\n")[2]
 
     # Another seed is added; trained otherwise is refused, and leaves nothing behind.

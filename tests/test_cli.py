@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from configparser import ConfigParser
+from dataclasses import replace
 from pathlib import Path
 
 import optuna
@@ -86,7 +87,9 @@ def test_train_without_an_auxiliary_loss_into_a_folder_of_its_own(folder: Path) 
     result = runner.invoke(app, ["train", "dm_control/cartpole-balance-v0", "--aux-loss", "none", *options])
     assert result.exit_code == 0, result.stderr
     (model,) = Path("runs").glob("*/model.zip")
-    assert str(model) in result.stdout
+    assert str(model) in result.stdout and "finished before" not in result.stdout
+    again = runner.invoke(app, ["train", "dm_control/cartpole-balance-v0", "--aux-loss", "none", *options])
+    assert again.exit_code == 0 and "finished before" in again.stdout
     assert SACAux.load(model).aux_loss is None
     assert model.parent.name.startswith("cartpole-balance")
 
@@ -100,8 +103,9 @@ def test_train_without_an_auxiliary_loss_into_a_folder_of_its_own(folder: Path) 
         (["cartpole-balance", "--steps", "100", "--evaluations", "5"], "too few"),
         (["cartpole-balance", "--config", "missing.yml"], "missing.yml: cannot be read"),
         (["cartpole-balance", "--steps", "many"], "--steps"),
+        (["CartPole-v1", "--steps", "1000"], "CartPole-v1 has no continuous actions"),
     ],
-    ids=["environment", "name", "notation", "steps", "file", "number"],
+    ids=["environment", "name", "notation", "steps", "file", "number", "actions"],
 )
 def test_errors_are_clear_and_exit_with_2(arguments: list[str], message: str) -> None:
     if "--config" not in arguments:
@@ -183,7 +187,7 @@ checkpoints: [400, 800]
 evaluation_episodes: 1
 cross_validation:
   environments: [dm_control/cartpole-balance-v0, dm_control/reacher-easy-v0]
-  seeds: [0, 1]
+  seeds: [1, 2]
   top: 3
 baselines:
 - {name: SAC}
@@ -216,6 +220,26 @@ def add_runs(grid: Grid, scores: dict[str, float], fails: Callable[[Cell], bool]
             study.add_trial(optuna.trial.create_trial(value=score, user_attrs=attributes))
 
 
+@pytest.mark.parametrize(
+    ("environment", "options", "message"),
+    [
+        ("dm_control/cartpole-balance-v0", "--cpus-per-trial 8", "--cpus-per-trial is for workers on a Ray cluster"),
+        ("dm_control/cartpole-balance-v0", "--ray-address auto", "--ray-address is for workers on a Ray cluster"),
+        ("CartPole-v1", "", "CartPole-v1 has no continuous actions"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused_before_anything_is_made(
+    environment: str, options: str, message: str, folder: Path
+) -> None:
+    (folder / "some.yml").write_text(
+        f"environment: {environment}\nhyperparameters: {folder / 'hyper.yml'}\ncheckpoints: [400]\n"
+    )
+    result = runner.invoke(app, ["search", "some.yml", *options.split()])
+    assert result.exit_code == 2
+    assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
+    assert not Path("runs").exists()
+
+
 def test_a_cross_validation_with_a_failed_run_ranks_the_others_and_says_so(
     cross_validation: Grid, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -241,6 +265,21 @@ def test_an_environment_on_which_all_fail_is_no_reason_not_to_rank(cross_validat
     assert result.exit_code == 1
     assert f"Winner: {best}" in result.stdout and "reacher" not in result.stdout and "Not ranked" not in result.stdout
     assert len(result.stderr.splitlines()) == 6
+
+
+def test_a_cross_validation_with_the_search_s_own_runs_says_so(
+    cross_validation: Grid, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert not caplog.records
+    config = load_config("some.yml")
+    assert config.cross_validation is not None
+    own = replace(config, cross_validation=replace(config.cross_validation, seeds=(0, 1)))
+    study = optuna.load_study(study_name="some", storage=open_storage("runs/some"))
+    make_grid(own, study)
+    assert "cross_validation.seeds has 0, as the search on dm_control/cartpole-balance-v0" in caplog.text
+    caplog.clear()
+    make_grid(replace(own, environment="dm_control/cheetah-run-v0"), study)
+    assert not caplog.records
 
 
 def test_a_cross_validation_without_any_run_has_no_winner(cross_validation: Grid) -> None:

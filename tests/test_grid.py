@@ -215,10 +215,10 @@ def test_variants_are_compared_that_have_all_runs_that_any_has() -> None:
 @pytest.mark.parametrize(
     ("returns", "expected"),
     [
-        # Mean of both -600, -200: each divided by that, its sign kept.
+        # Mean of both -600, -200: each divided by that, its sign kept. Sample deviations of two numbers.
         ({"a": [-300.0, -100.0], "b": [-900.0, -300.0]}, {"a": (-0.5, 0.0), "b": (-1.5, 0.0)}),
         # 200 and -600: a is 0.5 and -0.5, b 1.5 and -1.5.
-        ({"a": [100.0, -300.0], "b": [300.0, -900.0]}, {"a": (0.0, 0.5), "b": (0.0, 1.5)}),
+        ({"a": [100.0, -300.0], "b": [300.0, -900.0]}, {"a": (0.0, 0.5 * 2**0.5), "b": (0.0, 1.5 * 2**0.5)}),
         ({"a": [100.0, 30.0], "b": [300.0, 90.0]}, {"b": (1.0, 0.0), "a": (1 / 3, 0.0)}),
         ({"a": [0.0, 0.0], "b": [0.0, 0.0]}, {"a": (0.0, 0.0), "b": (0.0, 0.0)}),
     ],
