@@ -70,7 +70,7 @@ def test_train_shows_the_curve_and_says_where_the_model_is(folder: Path) -> None
     result = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert result.returncode == 0, result.stderr
     curve = read_curve(folder / "here" / "curve.csv")
-    # 60 agent steps of 40 simulator steps each.
+    # 60 agent steps of 40 environment steps each.
     assert [point.environment_steps for point in curve] == [1200, 2400]
     for point in curve:
         assert re.search(rf"{point.environment_steps:,}\D+{point.mean:.1f}\D+{point.std:.1f}", result.stdout)

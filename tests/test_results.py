@@ -53,8 +53,9 @@ def test_readme_of_planted_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         (path / ABOUT).write_text(json.dumps(runs[path]))
     (folder / "about.md").write_text("Planted\nWhat is said.\n")
     about = grid.about(grid.cells[0])
-    (line,) = make_readme["paper"]([{**about, "variant": "of_nobody"}])
+    line, reference = make_readme["paper"]([{**about, "variant": "of_nobody"}])
     assert "cheetah-run at 100,000, 10 runs: AARL-State 472 ± 30" in line
+    assert "not ours" in reference and "AARL-State 436" in reference
     assert not list(make_readme["paper"]([about]))  # it is in the table
 
     text = make_readme["readme"](tmp_path / "results")
