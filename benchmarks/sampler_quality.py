@@ -4,7 +4,9 @@ How good are the losses that a search finds? The samplers on synthetic objective
 Every sampler has 500 noisy evaluations; those of its proposals that are no valid loss are pruned and cost nothing. From
 the five losses with the best noisy scores (different canonical forms) the best true value counts, as cross-validation
 would find it. It is normalised: 0 is the mean of random losses, 1 the optimum. The noise of an evaluation is as large as
-the standard deviation of random losses. All objectives look at the canonical form only.
+the standard deviation of random losses, or ``NOISE`` times as large. All objectives look at the canonical form only.
+
+``MORE`` are of the same kinds and were drawn after the sampler was finished, to see whether it is good at the first ones only.
 """
 
 import argparse
@@ -45,14 +47,21 @@ class Objective(Protocol):
 
 
 class Tokens:
-    """Each token has a value of its own around the value of its kind: signs as in the paper's table 5 (Cheetah-Run)."""
+    """
+    Each token has a value of its own around the value of its kind: signs as in the paper's table 5 (Cheetah-Run).
 
-    def __init__(self) -> None:
-        rng = np.random.default_rng(1)
-        by_kind = {"s": (-0.3, 1.0), "a": (0.4, -0.7), "r": (0.2, -0.5)}  # in source and target
-        kinds = np.array([by_kind[Token.of(i).kind] for i in range(N_TOKENS)]).T
-        self.weights = kinds + rng.normal(0, 0.4, kinds.shape)
-        self.weights *= 0.8 ** (np.arange(N_TOKENS) // 3)  # what is far away matters less
+    :param seed: Seed of the values
+    :param spread: Their deviation around that of their kind
+    :param by_kind: Whether kinds have values; else all are around 0
+    :param decay: Of the values with each step: what is far away matters less
+    """
+
+    def __init__(self, seed: int = 1, spread: float = 0.4, by_kind: bool = True, decay: float = 0.8) -> None:
+        rng = np.random.default_rng(seed)
+        values = {"s": (-0.3, 1.0), "a": (0.4, -0.7), "r": (0.2, -0.5)}  # in source and target
+        kinds = np.array([values[Token.of(i).kind] for i in range(N_TOKENS)]).T * by_kind
+        self.weights = kinds + rng.normal(0, spread, kinds.shape)
+        self.weights *= decay ** (np.arange(N_TOKENS) // 3)
         self.weights[0, 0] = 1.0  # s_t is in the optimum, which makes it a valid and canonical one
         self.optimum = float(self.weights[self.weights > 0].sum())
 
@@ -97,21 +106,60 @@ class Patterns:
 
 
 class Pairs:
-    """Half of the value lies in single tokens that are as in a hidden loss, half in pairs that both have to be."""
+    """
+    Half of the value lies in single tokens that are as in a hidden loss, half in pairs that both have to be.
 
-    def __init__(self) -> None:
-        rng = np.random.default_rng(3)
+    :param seed: Seed of the hidden loss and the values
+    :param only: Whether single tokens have no value
+    """
+
+    def __init__(self, seed: int = 3, only: bool = False) -> None:
+        rng = np.random.default_rng(seed)
         self.hidden = (rng.random(2 * N_TOKENS) < 0.4) & (np.tile(np.arange(N_TOKENS), 2) < 22)  # horizon 7
         self.hidden[0] = self.hidden[N_TOKENS + 21] = True
         self.single = rng.exponential(size=2 * N_TOKENS)
         self.pairs = np.array([rng.choice(2 * N_TOKENS, size=2, replace=False) for _ in range(60)])
         self.double = rng.exponential(size=60)
         self.double *= self.single.sum() / self.double.sum()
+        self.single *= not only
         self.optimum = float(self.single.sum() + self.double.sum())
 
     def __call__(self, source: np.ndarray, target: np.ndarray) -> float:
         right = np.concatenate([source, target]) == self.hidden
         return float(self.single @ right + self.double @ right[self.pairs].all(axis=1))
+
+
+class Interactions:
+    """
+    Tokens, and pairs of them that are worth more or less together. The optimum is the best of 30 local ones, found by
+    changing one token at a time.
+
+    :param seed: Seed of the values
+    :param strength: Deviation of the pairs' values
+    """
+
+    def __init__(self, seed: int, strength: float) -> None:
+        rng = np.random.default_rng(seed)
+        self.weights = Tokens(seed).weights.ravel()
+        self.pairs = np.array([rng.choice(2 * N_TOKENS, 2, replace=False) for _ in range(80)])
+        self.together = rng.normal(0, strength, 80) * 0.8 ** ((self.pairs % N_TOKENS // 3).max(axis=1) / 2)
+        self.optimum = max(self._climb(rng.random(2 * N_TOKENS) < 0.5) for _ in range(30))
+
+    def _climb(self, chosen: np.ndarray) -> float:
+        chosen[0] = True  # s_t: valid and canonical
+        reached = self._value(chosen)
+        while True:
+            neighbours = [np.where(np.arange(len(chosen)) == i, ~chosen, chosen) for i in range(1, len(chosen))]
+            best = max(neighbours, key=self._value)
+            if self._value(best) <= reached:
+                return reached
+            chosen, reached = best, self._value(best)
+
+    def _value(self, chosen: np.ndarray) -> float:
+        return float(self.weights @ chosen + self.together @ chosen[self.pairs].all(axis=1))
+
+    def __call__(self, source: np.ndarray, target: np.ndarray) -> float:
+        return self._value(np.concatenate([source, target]))
 
 
 class Shape:
@@ -150,6 +198,16 @@ OBJECTIVES: dict[str, Callable[[], Objective]] = {
     "shape": Shape,
     "product": Product,
 }
+MORE: dict[str, Callable[[], Objective]] = {
+    "tokens 7": lambda: Tokens(7),
+    "tokens 8": lambda: Tokens(8),
+    "tokens 9": lambda: Tokens(9, spread=1.0, by_kind=False, decay=1.0),
+    "pairs 11": lambda: Pairs(11),
+    "pairs 12": lambda: Pairs(12, only=True),
+    "together 13": lambda: Interactions(13, 0.5),
+    "together 14": lambda: Interactions(14, 1.0),
+}
+NOISE = {"tokens 7": 2.0, "tokens 8": 0.5, "together 14": 2.0}
 
 
 def _masks(loss: AuxLoss) -> tuple[np.ndarray, np.ndarray]:
@@ -164,7 +222,7 @@ def run(cell: tuple[str, str, int, int]) -> dict[str, float | int | str]:
     """One search; the true value of the best of its top five, normalised."""
     objective_name, sampler_name, seed, n_evaluations = cell
     started = time.process_time()
-    objective = OBJECTIVES[objective_name]()
+    objective = {**OBJECTIVES, **MORE}[objective_name]()
     rng = np.random.default_rng(0)
     at_random = [objective(*_masks(random_loss(rng))) for _ in range(5000)]
     mean, deviation = float(np.mean(at_random)), float(np.std(at_random))
@@ -183,7 +241,7 @@ def run(cell: tuple[str, str, int, int]) -> dict[str, float | int | str]:
             n_invalid += 1
             continue
         value = objective(*_masks(loss))
-        score = value + deviation * noise.standard_normal()
+        score = value + NOISE.get(objective_name, 1.0) * deviation * noise.standard_normal()
         study.tell(trial, score)
         scores[loss] = max(scores.get(loss, (-np.inf, value)), (score, value))
         n_done += 1
@@ -197,13 +255,13 @@ def run(cell: tuple[str, str, int, int]) -> dict[str, float | int | str]:
 def report(cells: list[dict]) -> dict:
     """Print means and deviations, and Mann-Whitney's two-sided p for every pair; also over all objectives at once."""
     tables: dict = {}
-    for objective in [*OBJECTIVES, "all"]:
+    for objective in [*OBJECTIVES, *MORE, "all"]:
         found = [cell for cell in cells if objective in ("all", cell["objective"])]
         values = {name: [cell["best"] for cell in found if cell["sampler"] == name] for name in SAMPLERS}
         values = {name: those for name, those in values.items() if those}
         if not values:
             continue
-        print(f"\n{objective:10} {'n':>4} {'mean':>7} {'dev.':>6}   p against " + " ".join(f"{name:>9}" for name in values))
+        print(f"\n{objective:11} {'n':>3} {'mean':>7} {'dev.':>6}   p against " + " ".join(f"{name:>9}" for name in values))
         tables[objective] = {}
         for name, those in values.items():
             p = {other: float(mannwhitneyu(those, values[other]).pvalue) for other in values if other != name}
@@ -218,7 +276,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--evaluations", type=int, default=500)
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--objectives", nargs="+", default=list(OBJECTIVES), choices=OBJECTIVES)
+    parser.add_argument("--objectives", nargs="+", default=list(OBJECTIVES), choices={**OBJECTIVES, **MORE})
     parser.add_argument("--samplers", nargs="+", default=list(SAMPLERS), choices=SAMPLERS)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, help="JSON with all cells; what it has already is not run again")
