@@ -1,7 +1,6 @@
 """The paper's benchmark: variants (files of hyper-parameters) x tasks x seeds, every run in a folder of its own."""
 
 import itertools
-import json
 import re
 import reprlib
 from collections import Counter
@@ -15,19 +14,17 @@ import pandas as pd
 import torch as th
 
 from sb3_aarl import catalog
-from sb3_aarl.callbacks import read_curve, replace_text
+from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search.config import ConfigError, action_repeat, load_hyperparameters, named_environments, resolve_env_id
 from search.grid import SCORELESS, Cell, all_cells, check_training
 from search.objective import end_noted, mean_curve
-from search.provenance import provenance
+from search.provenance import ABOUT, provenance, read_about, write_about
 from search.storage import open_storage
 from search.training import check_actions, train_candidate
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
-# What stands beside a run's curve.csv.
-ABOUT = "provenance.json"
 UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
 
 
@@ -112,8 +109,8 @@ class Benchmark:
         about = self.about(cell)
         # A run that was killed and goes on has several.
         session = {**provenance(), "threads": th.get_num_threads()}
-        about["sessions"] = [*_read_about(path).get("sessions", ()), session]
-        _write_about(path, about)
+        about["sessions"] = [*read_about(path).get("sessions", ()), session]
+        write_about(path, about)
         with end_noted(trial, path):
             run = train_candidate(
                 cell.environment,
@@ -125,7 +122,7 @@ class Benchmark:
                 path,
             )
         trial.set_user_attr("curve", mean_curve([run.curve]))
-        _write_about(path, {**about, "seconds": run.curve[-1].seconds})
+        write_about(path, {**about, "seconds": run.curve[-1].seconds})
         return run.aulc
 
     def prepare(self, folder: Path) -> None:
@@ -144,13 +141,13 @@ class Benchmark:
         for cell in self.cells:
             path = run_folder(folder, cell)
             if not (path / ABOUT).exists():
-                _write_about(path, self.about(cell))
+                write_about(path, self.about(cell))
         for path, about in read_abouts(folder)[0].items():
             environment = about["environment"]
             of_now = list(self.checkpoints.get(environment, ()))
             # Written only where it differs: a worker of another program may be adding to it.
             if of_now not in ([], about.get("checkpoints")) and about.get("evaluations") == self.evaluations(environment):
-                _write_about(path, {**_read_about(path), "checkpoints": of_now})
+                write_about(path, {**read_about(path), "checkpoints": of_now})
 
 
 def load_benchmark(
@@ -236,7 +233,7 @@ def read_abouts(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[Path]]:
     of_cell: dict[Cell, Path] = {}
     trained: dict[tuple[str, str], Path] = {}
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{ABOUT}")):
-        about = _read_about(path)
+        about = read_about(path)
         if not {*Cell._fields, "checkpoints", "sessions"} <= about.keys():
             unreadable.append(path)
             continue
@@ -285,7 +282,7 @@ def note_failures(folder: Path, failures: Mapping[Cell, str]) -> None:
     """
     for cell, reason in failures.items():
         path = run_folder(folder, cell)
-        _write_about(path, {**_read_about(path), "failed": reason})
+        write_about(path, {**read_about(path), "failed": reason})
 
 
 def parse_steps(text: str) -> tuple[int, ...]:
@@ -349,16 +346,3 @@ def _training(about: Mapping[str, Any]) -> dict[str, Any]:
     """What decides a run's scores."""
     settings = {"evaluation_episodes": about.get("evaluation_episodes"), **about.get("hyperparameters", {})}
     return {key: value for key, value in settings.items() if key not in SCORELESS}
-
-
-def _read_about(path: Path) -> dict[str, Any]:
-    """What stands in a run's folder; nothing if it is not there, or torn."""
-    try:
-        about = json.loads((path / ABOUT).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
-        return {}
-    return about if isinstance(about, dict) else {}
-
-
-def _write_about(path: Path, about: Mapping[str, Any]) -> None:
-    replace_text(path / ABOUT, json.dumps(about, indent=1) + "\n")

@@ -197,8 +197,8 @@ def search(
 
         from search import evolve
         from search.config import load_config
+        from search.passwords import storage_name
         from search.pool import WorkerPool
-        from search.storage import storage_name
 
         changes: dict[str, Any] = {"stages": stages, "pruner": pruner}
         settings = replace(load_config(config), **{key: value for key, value in changes.items() if value is not None})
@@ -254,8 +254,8 @@ def worker(
         from functools import partial
 
         from search import evolve
+        from search.passwords import storage_name
         from search.pool import WorkerPool
-        from search.storage import storage_name
 
         console.print(f"Working for {storage_name(storage)}", soft_wrap=True, markup=False)
         launch = partial(WorkerPool, n_workers=workers, threads=threads)
@@ -848,7 +848,7 @@ def _search_folder(run: Path | None, storage: str | None, benchmarks: bool = Tru
 
     Benchmarks leave a study too, of runs without candidates, which can be watched but teach nothing about losses.
     """
-    from search.benchmark import ABOUT
+    from search.provenance import ABOUT
 
     def is_benchmark(folder: Path) -> bool:
         return any(folder.glob(f"*/*/*/{ABOUT}"))

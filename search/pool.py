@@ -16,7 +16,8 @@ from typing import Any, Protocol
 import torch as th
 from optuna.exceptions import StorageInternalError
 
-from search.storage import root_cause, without_password
+from search.passwords import without_password
+from search.storage import root_cause
 
 # Deaths of workers in one place, without a trial finished in between, after which the pool gives up.
 MAX_DEATHS = 5

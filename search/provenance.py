@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -13,7 +14,11 @@ from typing import Any
 
 import torch as th
 
-from search.storage import storage_name
+from sb3_aarl.callbacks import replace_text
+from search.passwords import storage_name
+
+# Of a run, in its folder.
+ABOUT = "provenance.json"
 
 PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "shimmy", "optuna", "numpy")
 
@@ -65,6 +70,29 @@ def provenance() -> dict[str, str]:
         "python": platform.python_version(),
         "versions": ", ".join(versions),
     }
+
+
+def read_about(path: Path) -> dict[str, Any]:
+    """
+    What stands in a run's folder; nothing if it is not there, or torn.
+
+    :param path: The folder
+    """
+    try:
+        about = json.loads((path / ABOUT).read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return {}
+    return about if isinstance(about, dict) else {}
+
+
+def write_about(path: Path, about: Mapping[str, Any]) -> None:
+    """
+    Leave in a run's folder how it is trained.
+
+    :param path: The folder
+    :param about: Plain values
+    """
+    replace_text(path / ABOUT, json.dumps(about, indent=1) + "\n")
 
 
 def save_result(path: Path, **result: Any) -> None:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
+from search.passwords import storage_name, without_password
 from search.pool import INTERRUPT_SECONDS, MAX_DEATHS, WorkerError, _interrupt_again, _interrupt_once, message
-from search.storage import storage_name, without_password
 
 try:
     import ray

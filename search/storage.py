@@ -33,6 +33,8 @@ from sqlalchemy import URL, create_engine, inspect
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError, PendingRollbackError, SQLAlchemyError
 
+from search.passwords import storage_name, without_password
+
 if sys.platform != "win32":
     import fcntl
 
@@ -687,35 +689,6 @@ def study_id(study: optuna.Study) -> str:
     if ID_KEY not in study.user_attrs:
         study.set_user_attr(ID_KEY, uuid.uuid4().hex)
     return study.user_attrs[ID_KEY]
-
-
-def without_password(text: str) -> str:
-    """
-    :param text: A URL, a connection string, or a message with such in it
-    :return: The same with the passwords replaced by ``***``
-    """
-    # A user's name may have an @, or a domain before a slash.
-    text = re.sub(r"(\b[a-zA-Z][\w+.-]*:/*[^:\s]*):\S*@", r"\1:***@", text)
-    return re.sub(r"(?i)((?:password|passwd|pwd)\s*=\s*)('(?:[^'\\]|\\.)*'|[^&\s]*)", r"\1***", text)
-
-
-def storage_name(where: str) -> str:
-    """
-    What messages call a storage.
-
-    :param where: As for :func:`open_storage`, or another argument of a program
-    :return: The same without a password, even if it is a URL with an error
-    """
-    if "://" not in where:
-        return without_password(where)
-    # Without blanks, which are an error in a URL, and would hide where its password ends.
-    shown = without_password("".join(where.split()))
-    try:
-        _ = urlsplit(shown).port
-    except ValueError:
-        if "@" not in shown and not shown.startswith("grpc:"):  # the host was forgotten, and the password stands for a port
-            return f"{shown.partition('://')[0]}://***"
-    return shown
 
 
 def root_cause(error: BaseException) -> str:

@@ -18,8 +18,9 @@ from scipy import stats
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search import operator_selection
-from search.benchmark import ABOUT, read_abouts, task_name
+from search.benchmark import read_abouts, task_name
 from search.grid import comparable
+from search.provenance import ABOUT
 
 # Resamples of the bootstrap.
 RESAMPLES = 9999

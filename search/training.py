@@ -28,6 +28,7 @@ from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes
 from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
 from search.checkpoint import CheckpointError, ResumableEnv, is_disk_error, key_path, opened, seal, sync_folder, user_key
 from search.config import VEC_ENVS, ConfigError, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
+from search.provenance import provenance, read_about, write_about
 
 logger = logging.getLogger(__name__)
 
@@ -243,7 +244,7 @@ def train_and_keep(
     folder: str | Path | None = None,
 ) -> tuple[TrainingRun, Path, bool]:
     """
-    Train with one loss and keep the model, with a progress bar.
+    Train with one loss and keep the model, the curve and ``provenance.json``, with a progress bar.
 
     :param environment: Id of the environment, or the short form of a DeepMind Control task
     :param aux_loss: Notation, name, or YAML file of ``load_aux_loss``; ``"none"`` for none; None for what the file of
@@ -276,7 +277,14 @@ def train_and_keep(
         label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {aux_loss or 'auto'}".lower())[:80].strip("-")
         settings = f"{loss} {hyperparameters} {checkpoints} {evaluation_episodes}"
         folder = Path("runs") / f"{label}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}-seed-{seed}"
-    was_finished = (Path(folder) / MODEL).exists()  # of another training: train_candidate refuses the folder
+    folder = Path(folder)
+    was_finished = (folder / MODEL).exists()  # of another training: train_candidate refuses the folder
+    about = {"environment": environment, "aux_loss": str(loss), "seed": seed, "hyperparameters": hyperparameters}
+    about |= {"evaluations": checkpoints, "evaluation_episodes": evaluation_episodes}
+    about = json.loads(json.dumps(about, default=str))
+    before = read_about(folder)
+    goes_on = all(before.get(key) == value for key, value in about.items())
+    about["sessions"] = [*(before["sessions"] if goes_on else ()), provenance()]
     run = train_candidate(
         environment,
         loss,
@@ -285,10 +293,13 @@ def train_and_keep(
         checkpoints,
         evaluation_episodes,
         folder,
+        on_evaluation=None if was_finished else lambda _: write_about(folder, about),
         keep_model=True,
         progress_bar=True,
     )
-    return run, Path(folder), was_finished
+    if not was_finished:
+        write_about(folder, {**about, "seconds": run.curve[-1].seconds})
+    return run, folder, was_finished
 
 
 @contextlib.contextmanager

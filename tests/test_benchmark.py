@@ -18,10 +18,11 @@ from typer.testing import CliRunner
 from sb3_aarl import AuxLoss
 from sb3_aarl.callbacks import read_curve
 from search import grid, provenance, table
-from search.benchmark import ABOUT, Benchmark, load_benchmark, parse_seeds, parse_steps, run_folder
+from search.benchmark import Benchmark, load_benchmark, parse_seeds, parse_steps, run_folder
 from search.cli import app
 from search.config import load_hyperparameters
 from search.grid import Cell
+from search.provenance import ABOUT
 from search.training import train_candidate
 
 ROOT = Path(__file__).parent.parent

@@ -1,5 +1,6 @@
 """The program: train and losses, as a user calls them."""
 
+import json
 import os
 import re
 import subprocess
@@ -88,8 +89,13 @@ def test_train_without_an_auxiliary_loss_into_a_folder_of_its_own(folder: Path) 
     assert result.exit_code == 0, result.stderr
     (model,) = Path("runs").glob("*/model.zip")
     assert str(model) in result.stdout and "finished before" not in result.stdout
+    about = json.loads((model.parent / "provenance.json").read_text())
+    assert (about["aux_loss"], about["evaluations"], len(about["sessions"])) == ("None", [400], 1)
+    assert about["seconds"] > 0 and about["hyperparameters"]["batch_size"] == HYPER["default"]["batch_size"]
+    assert {"commit", "command", "versions", "cpu"} <= about["sessions"][0].keys()
     again = runner.invoke(app, ["train", "dm_control/cartpole-balance-v0", "--aux-loss", "none", *options])
     assert again.exit_code == 0 and "finished before" in again.stdout
+    assert json.loads((model.parent / "provenance.json").read_text()) == about
     assert SACAux.load(model).aux_loss is None
     assert model.parent.name.startswith("cartpole-balance")
 

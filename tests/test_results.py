@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 import search.cli
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
-from search.benchmark import ABOUT, Benchmark, load_benchmark, read_abouts, run_folder
+from search.benchmark import Benchmark, load_benchmark, read_abouts, run_folder
+from search.provenance import ABOUT
 
 RESULTS = Path(__file__).parent.parent / "results"
 make_readme: dict[str, Any] = runpy.run_path(str(RESULTS / "make_readme.py"))

@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 from search import provenance
 from search import storage as storage_module
 from search.cli import app
-from search.storage import JOURNAL, open_storage, storage_name, without_password
+from search.passwords import storage_name, without_password
+from search.storage import JOURNAL, open_storage
 
 
 @pytest.mark.parametrize("kept", [1, 40, -1], ids=str)

@@ -18,9 +18,10 @@ from typer.testing import CliRunner
 from sb3_aarl.callbacks import Evaluation, write_curve
 from sb3_aarl.envs import env_ids
 from search import table
-from search.benchmark import ABOUT, run_folder
+from search.benchmark import run_folder
 from search.cli import app
 from search.grid import Cell
+from search.provenance import ABOUT
 
 # The paper's tables as its text has them; table 3 and the first part of table 4 have the asterisks and daggers left out.
 PAPER = {
