@@ -10,6 +10,7 @@ from collections.abc import Callable
 from configparser import ConfigParser
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import optuna
 import pytest
@@ -21,10 +22,12 @@ from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
+from search import training
 from search.cli import ZOO, app
 from search.config import load_config
 from search.cross_validation import make_grid
 from search.grid import MAX_TRIES, Cell, Grid
+from search.provenance import read_about, write_about
 from search.space import distributions, loss_to_params
 from search.storage import open_storage
 
@@ -98,6 +101,22 @@ def test_train_without_an_auxiliary_loss_into_a_folder_of_its_own(folder: Path) 
     assert json.loads((model.parent / "provenance.json").read_text()) == about
     assert SACAux.load(model).aux_loss is None
     assert model.parent.name.startswith("cartpole-balance")
+
+
+def test_a_training_that_goes_on_names_both_its_sessions(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments: tuple[Any, ...] = ("cartpole-balance", "none", "hyper.yml", 800, 2, 1, 0, "here")
+
+    def interrupt(path: Path, about: dict[str, Any]) -> None:
+        write_about(path, about)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "write_about", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            training.train_and_keep(*arguments)
+    assert len(read_about(folder / "here")["sessions"]) == 1 and not (folder / "here" / "model.zip").exists()
+    run, _, was_finished = training.train_and_keep(*arguments)
+    assert len(read_about(folder / "here")["sessions"]) == 2 and len(run.curve) == 2 and not was_finished
 
 
 @pytest.mark.parametrize(
