@@ -22,6 +22,7 @@ from scipy.stats import kendalltau, spearmanr, ttest_ind
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import KINDS, AuxLoss
+from search import workers
 from search.space import distributions, loss_to_params
 from search.trials import curve_of, lineage, loss_of, operation_of, parents_of, ranked, score_of, stage_of
 
@@ -443,16 +444,17 @@ def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     Where the trials were trained, and how long it took.
 
     :param trials: Trials of a study
-    :return: One row a device and commit, as ``Objective`` notes them: finished ``trials``, failed ones included; their
-        ``hours``, one trial after the other; ``core_hours`` (hours x threads; NaN for GPUs and where nothing is noted)
+    :return: One row a device and commit, as ``Objective`` notes them: finished ``trials``, failed ones included, but not
+        those whose workers died, nobody knows when; their ``hours``, one trial after the other; ``core_hours`` (hours x
+        threads; NaN for GPUs and where nothing is noted)
     """
     rows = []
     for trial in trials:
-        if trial.duration is not None:
+        if trial.duration is not None and workers.DIED_KEY not in trial.user_attrs:
             about = trial.user_attrs
             hours = trial.duration.total_seconds() / 3600
-            cores = about.get("threads", 1) if about.get("device", "").startswith("CPU") else np.nan
-            rows.append((about.get("device", "not noted"), about.get("commit", "not noted"), hours, hours * cores))
+            device, commit = (str(about.get(key, "not noted")) for key in ("device", "commit"))
+            rows.append((device, commit, hours, hours * about.get("threads", 1) if device.startswith("CPU") else np.nan))
     table = pd.DataFrame(rows, columns=["device", "commit", "hours", "core_hours"])
     groups = table.groupby(["device", "commit"], sort=False)
     # Of nothing but NaN: NaN, not 0.

@@ -31,6 +31,7 @@ from search.plots import evolution_figure, learning_curves_figure, learning_curv
 from search.sampler import SETTINGS_KEY
 from search.storage import load_study
 from search.trials import lineage, loss_of, operation_of, parents_of, ranked, score_of, stage_of
+from search.workers import DIED_KEY
 
 N_BEST = 10
 N_CURVES = 5
@@ -69,7 +70,8 @@ def stage_rows(study: Study) -> list[StageRow]:
     settings = study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY)
     for trial in study.get_trials(deepcopy=False):
         # A worker that asks for more than there is left leaves a trial that never had a place. Other samplers have no stages.
-        if settings is None or "stage" in trial.user_attrs or trial.state == TrialState.WAITING:
+        is_invalid = trial.state == TrialState.PRUNED and loss_of(trial) is None  # that costs nothing
+        if not is_invalid and (settings is None or "stage" in trial.user_attrs or trial.state == TrialState.WAITING):
             stages.setdefault(stage_of(trial), []).append(trial)
     best = max if study.direction == StudyDirection.MAXIMIZE else min
     rows = []
@@ -122,11 +124,11 @@ def stored_baselines(storage: BaseStorage, name: str) -> list[tuple[str, float]]
 
 def time_spent(trials: Iterable[FrozenTrial]) -> timedelta:
     """
-    How long all finished trials took together.
+    How long all finished trials took together, without those whose workers died: nobody knows when.
 
     :param trials: The trials
     """
-    durations = (trial.duration for trial in trials)
+    durations = (trial.duration for trial in trials if DIED_KEY not in trial.user_attrs)
     return sum((duration for duration in durations if duration is not None), timedelta())
 
 

@@ -9,7 +9,7 @@ import threading
 import time
 import zlib
 from collections import defaultdict
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from itertools import islice
 from types import FrameType
 from typing import Any, NamedTuple
@@ -39,6 +39,8 @@ REJECTED_KEY = "AuxLossSampler:rejected"
 # A trial without a place shows with this user attribute that its worker still waits for one.
 WAITING_KEY = "waiting"
 SETTINGS_KEY = "AuxLossSampler:settings"
+# Optuna's: what study.enqueue_trial was given.
+FIXED_KEY = "fixed_params"
 
 # Draws for one place before a duplicate is accepted: only very small spaces run out of new losses.
 MAX_DRAWS = 300
@@ -86,9 +88,14 @@ class StageProgress(NamedTuple):
 
 
 class _Register:
-    """What the storage says of the places; each refresh reads trials that are new or were not finished before."""
+    """
+    What the storage says of the places; each refresh reads trials that are new or were not finished before.
 
-    def __init__(self) -> None:
+    :param operations: What the places of a stage are for; a trial of another study may have one that there is not
+    """
+
+    def __init__(self, operations: Callable[[int], Sequence[str]]) -> None:
+        self.operations = operations
         self.trials: Sequence[FrozenTrial] = ()
         self.open: set[int] = set()  # numbers of trials that are not finished
         self.places: dict[int, tuple[int, int]] = {}  # stage and place of each trial that has one
@@ -106,7 +113,8 @@ class _Register:
         self.trials = trials
         for number in changed:
             claim = trials[number].system_attrs.get(PLACE_KEY)
-            place = None if claim is None else (claim["stage"], claim["place"])
+            there_is = claim is not None and claim["place"] < len(self.operations(claim["stage"]))
+            place = (claim["stage"], claim["place"]) if there_is else None
             before = self.places.get(number)
             if place != before:
                 if before is not None:
@@ -149,6 +157,19 @@ class _Register:
             if rejected or deaths > retries:
                 attempt, deaths = attempt + 1, 0
         return attempt
+
+    def enqueued(self, stage: int, place: int, retries: int) -> dict[str, Any] | None:
+        """What a user enqueued and the place's last trial had, if its worker was interrupted or died: it has another try."""
+        given, deaths = None, 0
+        for number in self.holders.get((stage, place), ()):
+            trial = self.trials[number]
+            was_enqueued = trial.system_attrs[PLACE_KEY]["loss"] is None
+            if not was_enqueued or trial.state != TrialState.FAIL or REJECTED_KEY in trial.system_attrs:
+                given, deaths = None, 0
+                continue
+            given = trial.system_attrs.get(FIXED_KEY, given)
+            deaths += not trial.user_attrs.get("interrupted")
+        return given if deaths <= retries else None
 
     def unplaced(self, before: int | None = None) -> list[FrozenTrial]:
         """Trials, before this one, that run and may still ask for a place."""
@@ -268,7 +289,7 @@ class AuxLossSampler(BaseGASampler):
     def _reset(self) -> None:
         self._lock = threading.Lock()
         self._study: tuple[Any, int] | None = None
-        self._register = _Register()
+        self._register = _Register(self.operations)
         self._evolution: _Evolution | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -327,7 +348,7 @@ class AuxLossSampler(BaseGASampler):
         try:
             # Signs of life from the beginning on, where study.optimize will go on with them, and before the name: a trial
             # with a name but without any sign would be alive for ever on another machine.
-            wait = _Wait(study, trial, beats=_in_optimize(study, None) is not None)
+            wait = _Wait(study, trial, _in_optimize(study, None) is not None)
             worker = workers.identity() if self.worker == "auto" else self.worker
             if worker != trial.user_attrs.get(workers.WORKER_KEY):  # a heartbeat's copy has the name of the dead
                 _show(study, trial, workers.WORKER_KEY, worker)
@@ -350,7 +371,7 @@ class AuxLossSampler(BaseGASampler):
                 raise ValueError(f"AuxLossSampler draws whole losses, another sampler must not fix {', '.join(taken)}")
             return params
         # Enqueued: what the user left open is drawn at random, so that a valid loss comes out if there is one.
-        given = {**trial.params, **trial.system_attrs.get("fixed_params", {})}
+        given = {**trial.params, **trial.system_attrs.get(FIXED_KEY, {})}
         rng = np.random.default_rng([claim["seed"], claim["stage"], claim["place"], claim["attempt"]])
         for _ in range(MAX_DRAWS):
             params = {
@@ -413,10 +434,15 @@ class AuxLossSampler(BaseGASampler):
         if self._study is None or self._study[0] is not storage or self._study[1] != study_id:
             self._check_settings(study)
             self._study = (storage, study_id)
-            self._register = _Register()
+            self._register = _Register(self.operations)
             self._evolution = None
         # Not study.get_trials: a pruner may have wrapped the study so that it shows some of the trials only.
-        self._register.refresh(storage.get_all_trials(study_id, deepcopy=False))
+        trials = storage.get_all_trials(study_id, deepcopy=False)
+        if _is_another(trials, self._register.trials):  # SQLite gives the number of a deleted study to the next one
+            self._check_settings(study)
+            self._register = _Register(self.operations)
+            self._evolution = None
+        self._register.refresh(trials)
 
     def _check_settings(self, study: Study) -> None:
         """Refuse to go on with a study that was begun with other settings: its places mean something else."""
@@ -455,7 +481,7 @@ class AuxLossSampler(BaseGASampler):
                         return wait.end()
                     self._give_back(study, trial)
                 elif not ahead or register.holders:  # who chooses first may bring the study's seed
-                    is_given = bool(trial.params) or "fixed_params" in trial.system_attrs
+                    is_given = bool(trial.params) or FIXED_KEY in trial.system_attrs
                     free = self._nth_free(study, len(ahead), is_given)
                     if free is not None and self._take(study, trial, *free, is_given):
                         return wait.end()
@@ -494,7 +520,8 @@ class AuxLossSampler(BaseGASampler):
         evolution = self._get_evolution(study)
         attempt = self._register.attempt(stage, place, self.retries)
         operation, parents, loss = "enqueued", [], None
-        if not is_given:
+        left_over = None if is_given else self._register.enqueued(stage, place, self.retries)
+        if not is_given and left_over is None:
             candidate = evolution.candidate(stage, place, attempt)
             operation, parents, loss = candidate.operation, list(candidate.parents), str(candidate.loss)
         storage, trial_id = study._storage, trial._trial_id
@@ -507,6 +534,9 @@ class AuxLossSampler(BaseGASampler):
         if self._register.is_shared(trial.number):
             self._give_back(study, trial)
             return False
+        if left_over is not None:
+            storage.set_trial_system_attr(trial_id, FIXED_KEY, left_over)
+            trial.system_attrs[FIXED_KEY] = left_over
         # For people: what a lineage in the dashboard is made of.
         shown: dict[str, Any] = {"stage": stage, "place": place, "operation": operation, "parents": parents}
         if attempt:
@@ -582,6 +612,14 @@ def _in_optimize(study: Study, trial: FrozenTrial | None) -> FrameType | None:
     return frame if is_same and (None if its is None else its._trial_id) == (trial and trial._trial_id) else None
 
 
+def _is_another(trials: Sequence[FrozenTrial], before: Sequence[FrozenTrial]) -> bool:
+    """Whether these are not the trials of before, and maybe more."""
+    if len(trials) < len(before):
+        return True
+    started = before[0].datetime_start if before else None
+    return started is not None and trials[0].datetime_start != started
+
+
 def _show(study: Study, trial: FrozenTrial, key: str, value: Any) -> None:
     """Set a user attribute of a trial that is asked for; ``trial.user_attrs`` in the objective has it too."""
     study._storage.set_trial_user_attr(trial._trial_id, key, value)
@@ -596,12 +634,13 @@ def _is_invalid(trial: FrozenTrial) -> bool:
 class _Wait:
     """Waiting for a place: cheap, visible in the log and as a user attribute, and not for the dead."""
 
-    def __init__(self, study: Study, trial: FrozenTrial, beats: bool):
+    def __init__(self, study: Study, trial: FrozenTrial, in_optimize: bool):
         self.study = study
         self.trial = trial
+        self.in_optimize = in_optimize
         storage: Any = study._storage
         # Twice in an interval, as long as this waits.
-        self.beat_every = storage.get_heartbeat_interval() / 2 if beats and is_heartbeat_enabled(storage) else math.inf
+        self.beat_every = storage.get_heartbeat_interval() / 2 if in_optimize and is_heartbeat_enabled(storage) else math.inf
         self.beaten = -math.inf
         self.beat()
         self.delay = 0.001
@@ -632,6 +671,12 @@ class _Wait:
                 logger.warning("Trial %d never got a place, its worker seems to have died", other.number)
                 workers.fail(self.study, other, "its worker died before it got a place")
         if now - self.shown > ORPHAN_SECONDS / 6 and self.delay > 0.1:
+            if not (self.shown or self.in_optimize):
+                logger.warning(
+                    "study.ask() waits for a place until one of the %d trials that run is told. Whoever asks for several "
+                    "before he tells has sampler.has_place(study) to know how many there are",
+                    len(running),
+                )
             self.shown = now
             logger.info("Trial %d waits for a place: %d trials run", self.trial.number, len(running))
             # Changes each time: a sign of life for the trials behind this one.

@@ -41,11 +41,11 @@ def operation_of(trial: FrozenTrial) -> str:
 
 
 def parents_of(trial: FrozenTrial) -> list[int]:
-    """Numbers of the trials that a candidate stems from: they finished before it was drawn."""
+    """Numbers of the trials that a candidate stems from; a trial that had to wait for its place has a lower one than they."""
     parents = trial.user_attrs.get("parents")
     if not isinstance(parents, list):
         return []
-    return [number for number in parents if isinstance(number, int) and 0 <= number < trial.number]
+    return [number for number in parents if isinstance(number, int) and number >= 0 and number != trial.number]
 
 
 def curve_of(trial: FrozenTrial) -> list[tuple[int, float, float]]:

@@ -2,6 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from datetime import datetime, timedelta
 
 import lxml.html
@@ -13,11 +14,13 @@ from browser import open_browser, requested
 from hypothesis import given
 from hypothesis import strategies as st
 from optuna.distributions import FloatDistribution
+from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, TrialState
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
+from search import analysis
 from search.notation import mathml, subscripts
 from search.report import stage_rows, stored_baselines, stored_runs, time_spent, write_report
 from search.sampler import AuxLossSampler, SearchComplete
@@ -135,6 +138,25 @@ def test_places_of_a_search():
     assert [(row.completed, row.failed) for row in stage_rows(done)] == [(2, 0)]
 
 
+def test_what_is_no_loss_was_not_stopped_early():
+    study = optuna.create_study(sampler=RandomSampler(seed=0), direction="maximize")
+    study.optimize(lambda trial: float(suggest_aux_loss(trial, 1).horizon), n_trials=40)
+    states = Counter(trial.state for trial in study.trials)
+    assert min(states[TrialState.PRUNED], states[TrialState.COMPLETE]) > 0
+    assert [(row.completed, row.pruned) for row in stage_rows(study)] == [(states[TrialState.COMPLETE], 0)]
+
+
+def test_hours_of_trials_whose_workers_died_are_not_known():
+    hours = 13
+    trials = [
+        make_trial(0, TrialState.COMPLETE, 1.0, 3600 * hours, device=0, commit=["a"]),
+        make_trial(1, TrialState.FAIL, None, 3600 * hours, died=True),
+    ]
+    (row,) = analysis.machines(trials).reset_index().to_dict("records")
+    assert (row["device"], row["commit"], row["trials"], row["hours"]) == ("0", "['a']", 1, hours)
+    assert time_spent(trials) == timedelta(hours=hours)
+
+
 def test_what_the_report_says(study, tmp_path):
     path = tmp_path / "deep" / "report.html"
     write_report(study, path, [("SAC & co", 150.0)], {"environment": EVIL}, {"commit": "abc123", "cpu": "2 cores"})
@@ -224,7 +246,7 @@ def test_what_other_studies_of_the_storage_add(study, tmp_path):
     page = read_page(tmp_path / "report.html")
     rows = table_after(page, "Cross-validation")
     assert [row[0].endswith(loss) for row, loss in zip(rows, losses[1::-1], strict=True)] == [True, True]
-    assert [row[1:] for row in rows] == [["10.5", "10.5", "10.5", "0.5", "4"], ["0.5", "0.5", "0.5", "0.5", "4"]]
+    assert [row[1:] for row in rows] == [["10.5", "10.5", "10.5", "0.6", "4"], ["0.5", "0.5", "0.5", "0.6", "4"]]
     assert "1 without all runs are left out." in " ".join(page.text_content().split())
     write_report(study, tmp_path / "report.html", validation=stored_runs(storage, "nothing"))
     assert "Cross-validation" not in read_page(tmp_path / "report.html").text_content()

@@ -1,5 +1,6 @@
 """AuxLossSampler: stages, selection, lineage, places, and that all workers agree on them."""
 
+import contextlib
 import copy
 import pickle
 import sys
@@ -365,6 +366,77 @@ def test_what_objectives_write_on_trials_steers_nothing() -> None:
         study.sampler = make_study(seed=None).sampler  # as if each trial had a process of its own
         study.optimize(objective, n_trials=1, catch=(DivergedError,))
     assert losses(run(study, failing)) == losses(run(make_study(), failing))
+
+
+@pytest.mark.parametrize("ends", ["interrupted", "killed", "fails"])
+def test_an_enqueued_loss_has_another_try_unless_it_failed(ends: str) -> None:
+    loss = AuxLoss.parse("{s_t, a_t} -> {r_t, s_t+1}")
+    study = make_study(retries=1)
+
+    def objective(trial: optuna.Trial) -> float:
+        if suggest_aux_loss(trial, 2) != loss:
+            return 1.0
+        tries.append(trial.number)
+        if ends == "fails":
+            raise DivergedError
+        if ends == "interrupted" and len(tries) < 4:
+            raise KeyboardInterrupt
+        return 9.0
+
+    tries: list[int] = []
+    study.enqueue_trial(loss_to_params(loss))
+    if ends == "killed":
+        for _ in range(2):  # of one try and one retry nothing is left
+            trial = study.ask()
+            assert params_to_loss(trial.relative_params) == loss and trial.user_attrs["operation"] == "enqueued"
+            workers.fail(study, study.trials[trial.number], "its worker died")
+            tries.append(trial.number)
+            place = place_of(trial)
+        assert study.ask().user_attrs["operation"] == study.sampler.operations(1)[place[1]]
+        return
+    for _ in range(4):
+        with contextlib.suppress(KeyboardInterrupt):
+            study.optimize(objective, n_trials=2, catch=(DivergedError,))
+    assert len(tries) == (4 if ends == "interrupted" else 1)
+    assert [trial.value for trial in study.trials if trial.value == 9.0] == ([9.0] if ends == "interrupted" else [])
+    assert len({place_of(study.trials[number]) for number in tries}) == 1
+
+
+def test_a_study_that_was_deleted_and_begun_anew_has_its_own_places(tmp_path: Path) -> None:
+    sampler = make_study(n_random=3, n_prior=1).sampler
+    for value in (1.0, 2.0):
+        url = f"sqlite:///{tmp_path / 'study.db'}"
+        study = optuna.create_study(storage=url, study_name="again", sampler=sampler, direction="maximize")
+        for place in range(4):
+            trial = study.ask()
+            assert place_of(trial) == (1, place)
+            suggest_aux_loss(trial, 2)
+            study.tell(trial, value)
+        optuna.delete_study(study_name="again", storage=url)
+
+
+def test_trials_of_a_larger_search_have_no_places_in_a_smaller_one() -> None:
+    larger = make_study(n_stages=1, n_random=6, n_prior=2)
+    run(larger)
+    study = make_study(n_random=2, n_prior=1)
+    study.add_trials(larger.trials)
+    run(study)
+    assert {place for place in filled_places(study) if place[0] == 1} >= {(1, 0), (1, 1), (1, 2)}
+
+
+def test_who_asks_for_more_than_there_are_places_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def sleep(seconds: float) -> None:
+        if "study.ask() waits for a place until one of the 2 trials that run is told" in caplog.text:
+            raise TimeoutError
+
+    study = make_study(n_random=1, n_prior=1, population_size=2, random=0, replacement=0.7)
+    for _ in range(2):
+        study.ask()
+    monkeypatch.setattr(module.time, "sleep", sleep)
+    with pytest.raises(TimeoutError):
+        study.ask()
 
 
 def test_random_numbers_of_anything_else_do_not_matter() -> None:
