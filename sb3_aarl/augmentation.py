@@ -63,12 +63,14 @@ def center_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
     return images[:, :, top : top + size, left : left + size]
 
 
-def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
+def image_spaces(space: spaces.Space, normalized_image: bool = False) -> dict[str, spaces.Box]:
     """
     The images among observations.
 
     :param space: Observation space, images channel first
+    :param normalized_image: Whether images need not be bytes (SB3's ``normalize_images=False``)
     :return: Key to image space; the key is empty where observations are not a Dict
     """
     parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    return {key: part for key, part in parts.items() if isinstance(part, spaces.Box) and is_image_space(part)}
+    boxes = {key: part for key, part in parts.items() if isinstance(part, spaces.Box)}
+    return {key: part for key, part in boxes.items() if is_image_space(part, normalized_image=normalized_image)}

@@ -44,6 +44,8 @@ def _equal(one: np.ndarray, other: np.ndarray) -> bool:
 
 # Memory that drawn observations had, and that others may have after them: pieces and bytes in all, at most.
 MAX_SCRATCH, MAX_SCRATCH_BYTES = 8, 2**28
+# Of equal width.
+SIGNED = {th.uint16: th.int16, th.uint32: th.int32, th.uint64: th.int64}
 
 
 class FrameStore:
@@ -149,12 +151,15 @@ class FrameStore:
         corners = None if crop_size is None else self._random_corners(newest.shape, crop_size)
         stacked = self._read(self.frames, numbers, crop_size, corners)
         is_final = th.as_tensor(final >= 0, device=self.device)
+        # PyTorch cannot write to places of unsigned numbers but bytes.
+        written = stacked.view(SIGNED.get(stacked.dtype, stacked.dtype))
         if (final >= 0).any():
             corners = None if corners is None else corners[:, is_final, -1]
-            stacked[is_final, -1] = self._read(self.final_frames, final[final >= 0], crop_size, corners)
+            finals = self._read(self.final_frames, final[final >= 0], crop_size, corners)
+            written[is_final, -1] = finals.view(written.dtype)
         before = (back > age[..., None]) & zero_padded[..., None]
         if before.any():
-            stacked[th.as_tensor(before, device=self.device)] = 0
+            written[th.as_tensor(before, device=self.device)] = 0
         return stacked.flatten(newest.ndim, newest.ndim + 1) if self.stack > 1 else stacked.squeeze(newest.ndim)
 
     def _random_corners(self, shape: tuple[int, ...], crop_size: int) -> th.Tensor:
@@ -401,7 +406,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         current, following = self._by_key(obs), self._by_key(next_obs)
         action = np.asarray(action).reshape(self.n_envs, self.action_dim)
         reward = np.asarray(reward).reshape(self.n_envs)
-        done = np.asarray(done, bool).reshape(self.n_envs)
+        done = np.array(done, bool).reshape(self.n_envs)  # a copy: it is looked at again with the next transition
         starts = self._episode_over.copy()
         for key, last in self._last_next_obs.items():
             starts |= [not _equal(*pair) for pair in zip(current[key], last, strict=True)]
@@ -468,8 +473,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
                     if old[env, :-1].any():
                         raise self._stack_error(key, env, "an episode begins neither with one frame repeated nor with zeros")
                     zero_padded[key][env] = True
-                # VecNormalize, whose spaces are always float, gives an episode's last observation back with rounding errors.
-                rounded = done[env] and np.issubdtype(store.dtype, np.floating)
+                # VecNormalize gives an episode's last observation back with rounding errors; images are floats then.
+                rounded = done[env] and (np.issubdtype(store.dtype, np.floating) or len(store.shape) == 1)
                 if not rounded and not _equal(new[env, :-1], old[env, 1:]):
                     raise self._stack_error(key, env, "the next observation is not the last one plus one new frame")
         return zero_padded
@@ -593,7 +598,8 @@ def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
 
     :param env: Vectorized environment, images transposed as SB3's algorithms do
     :return: The size of SB3's VecFrameStack, else of Gymnasium's FrameStackObservation; for Dict observations by key.
-        1 without them, where the first axis is not a multiple of it, and where VecFrameStack took the last axis
+        1 without them, where the first axis is not a multiple of it, where VecFrameStack took the last axis, and where a
+        wrapper outside of it has given observations other keys
     """
     space = env.observation_space
     parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
@@ -608,6 +614,9 @@ def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
     stacks: dict[str, int] = {}
     for key, part in parts.items():
         shape = part.shape or (1,)
-        first_axis = not inner or inner[key].channels_first or len(shape) == 1 or is_image_space(part)
-        stacks[key] = stack if first_axis and shape[0] % stack == 0 else 1
+        # A wrapper outside may have taken one of several observations: what it is called inside is not known.
+        stacked = inner.get(key)
+        is_known = not inner or stacked is not None
+        first_axis = stacked is None or stacked.channels_first or len(shape) == 1 or is_image_space(part)
+        stacks[key] = stack if is_known and first_axis and shape[0] % stack == 0 else 1
     return stacks if isinstance(space, spaces.Dict) else stacks[""]

@@ -133,9 +133,9 @@ class LearningCurveCallback(BaseCallback):
         self.path = None if path is None else Path(path)
         self.on_evaluation = on_evaluation
         self.curve = list(curve)
-        self._seconds_before = self.curve[-1].seconds if self.curve else 0.0
 
     def _on_training_start(self) -> None:
+        self._seconds_before = self.curve[-1].seconds if self.curve else 0.0
         self._started = time.monotonic()
 
     def _on_step(self) -> bool:

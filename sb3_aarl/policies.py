@@ -31,7 +31,7 @@ class _CropsImages:
 
     @cached_property
     def image_keys(self) -> frozenset[str]:
-        return frozenset(image_spaces(self.observation_space))
+        return frozenset(image_spaces(self.observation_space, not self.normalize_images))
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         return features_extractor(self.preprocess(obs))
@@ -316,13 +316,13 @@ class SACAuxPolicy(SACPolicy):
         ortho_init: bool = False,
         **kwargs: Any,
     ):
-        self.augmentation = resolve_augmentation(augmentation, observation_space, crop_size)
-        self.image_keys = frozenset(image_spaces(observation_space))
+        normalize_images = kwargs.get("normalize_images", True)
+        self.augmentation = resolve_augmentation(augmentation, observation_space, crop_size, not normalize_images)
+        self.image_keys = frozenset(image_spaces(observation_space, not normalize_images))
         self.crop_size = CROP_SIZE if crop_size is None else crop_size
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
         encoder = encoder_class(features_extractor_class or self.default_encoder)
-        normalize_images = kwargs.get("normalize_images", True)
         if issubclass(encoder, MultiInputEncoder) and not normalize_images:
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
         # As SB3's NatureCNN: floats that nobody scales are mostly a mistake.
@@ -379,7 +379,9 @@ class SACAuxPolicy(SACPolicy):
         return self.optimizer_class(parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        space = cropped_space(self.observation_space, self.crop_size) if self.crops else self.observation_space
+        space = self.observation_space
+        if self.crops:
+            space = cropped_space(space, self.crop_size, not self.normalize_images)
         return self.features_extractor_class(space, **self.features_extractor_kwargs)
 
     @property
@@ -440,32 +442,35 @@ class MultiInputPolicy(SACAuxPolicy):
     default_encoder = MultiInputEncoder
 
 
-def cropped_space(space: spaces.Space, size: int) -> spaces.Space:
+def cropped_space(space: spaces.Space, size: int, normalized_image: bool) -> spaces.Space:
     """
     The observation space after images were cropped.
 
     :param space: Observation space, images channel first
     :param size: Height and width in pixels of cropped images
+    :param normalized_image: As in :func:`image_spaces`
     """
-    cropped = {key: spaces.Box(0, 255, (box.shape[0], size, size), box.dtype) for key, box in image_spaces(space).items()}  # type: ignore[arg-type]
+    images = image_spaces(space, normalized_image)
+    cropped = {key: spaces.Box(0, 255, (box.shape[0], size, size), box.dtype) for key, box in images.items()}  # type: ignore[arg-type]
     if isinstance(space, spaces.Dict):
         return spaces.Dict({**space.spaces, **cropped})
     return cropped.get("", space)
 
 
-def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int | None) -> str:
+def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int | None, normalized_image: bool) -> str:
     """
     What ``augmentation`` means for these observations.
 
     :param augmentation: One of ``AUGMENTATIONS``
     :param space: Observation space, images channel first
     :param crop_size: Height and width in pixels of cropped images, None for 84 if images are larger
+    :param normalized_image: As in :func:`image_spaces`
     :return: ``random_crop``, ``random_shift`` or ``none``
     :raises ValueError: for an unknown name, and for images that are smaller than the crop
     """
     if augmentation not in AUGMENTATIONS:
         raise ValueError(f"unknown augmentation {augmentation!r}, expected one of {', '.join(AUGMENTATIONS)}")
-    sizes = {key: box.shape[1:] for key, box in image_spaces(space).items()}
+    sizes = {key: box.shape[1:] for key, box in image_spaces(space, normalized_image).items()}
     if not sizes:
         return "none"
     needs_crop = augmentation == "random_crop" or (augmentation == "auto" and crop_size is not None)

@@ -15,13 +15,13 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update
 from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
 
 from sb3_aarl import catalog
-from sb3_aarl.augmentation import image_spaces
 from sb3_aarl.aux_head import AuxHead
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
@@ -69,7 +69,8 @@ class SACAux(SAC):
     :param gradient_steps: As in SB3; -1 for one per transition
     :param action_noise: As in SB3
     :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
-    :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is found out from the wrappers unless given
+    :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is found out from the wrappers unless given, but
+        has to be given for a class of your own
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns, not for Dict observations (as in SB3)
     :param ent_coef: Entropy coefficient; ``"auto_0.1"`` learns it from 0.1 on
@@ -86,7 +87,8 @@ class SACAux(SAC):
     :param device: Device of the networks
     :param aux_loss: An AuxLoss, its notation, a name of the catalogue, or None for SAC with the same encoder (the
         paper's baseline). ``"auto"`` is AARL-Pixel if any observation is an image and AARL-State otherwise, and None
-        where neither can be trained: the encoder has no parameters, or the replay buffer gives no windows
+        where neither can be trained: the encoder has no parameters that learn, or the replay buffer gives no windows
+        (HerReplayBuffer is refused unless it is None)
     :param aux_coef: Weight lambda of the auxiliary loss (equation 1). It matters with ``joint_optimizer=True``; by
         default the auxiliary loss has an Adam of its own, which divides a constant factor out again
     :param aux_batch_size: Windows for each auxiliary update, None for ``batch_size``
@@ -220,6 +222,7 @@ class SACAux(SAC):
         self.allow_tf32 = allow_tf32
 
         self._graphed_step: GraphedStep | None = None
+        self._frame_stack: int | dict[str, int] | None = None  # of the env that the buffer was made for
         self.aux_head: AuxHead | None = None
         self.aux_optimizer: th.optim.Optimizer | None = None
         self._n_aux_skipped = 0
@@ -255,10 +258,10 @@ class SACAux(SAC):
             # SB3 warns that a buffer class of the user's own goes without n_steps; this one does not.
             self.replay_buffer_class = None
             self.replay_buffer = self.replay_buffer or self._make_replay_buffer()
-        policy_kwargs = self.policy_kwargs
+        policy_kwargs, random_state = self.policy_kwargs, self._random_state
         self.policy_kwargs = {"augmentation": self.augmentation, "crop_size": self.crop_size, **policy_kwargs}
         super()._setup_model()
-        self.policy_kwargs = policy_kwargs
+        self.policy_kwargs, self._random_state = policy_kwargs, random_state
         if own_buffer:
             self.replay_buffer_class = WindowReplayBuffer
 
@@ -311,8 +314,9 @@ class SACAux(SAC):
         assert self.n_steps == 1 or not isinstance(self.observation_space, spaces.Dict), (
             f"n_steps={self.n_steps}: n-step returns are not supported for Dict observation spaces"
         )
-        if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
-            self.replay_buffer_kwargs["frame_stack"] = detect_frame_stack(self.env)
+        if self.env is not None:
+            self._frame_stack = detect_frame_stack(self.env)
+        found = {} if self._frame_stack is None else {"frame_stack": self._frame_stack}
         n_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
         try:
             return WindowReplayBuffer(
@@ -321,7 +325,7 @@ class SACAux(SAC):
                 self.action_space,
                 self.device,
                 self.n_envs,
-                **{**self.replay_buffer_kwargs, **(n_steps if self.n_steps > 1 else {})},
+                **{**found, **self.replay_buffer_kwargs, **(n_steps if self.n_steps > 1 else {})},
             )
         except (MemoryError, th.cuda.OutOfMemoryError) as error:
             raise MemoryError(
@@ -329,10 +333,10 @@ class SACAux(SAC):
             ) from error
 
     def _setup_aux_loss(self, own_buffer: bool) -> None:
-        encoder = list(self.critic.features_extractor.parameters())
+        encoder = [parameter for parameter in self.critic.features_extractor.parameters() if parameter.requires_grad]
         if self.aux_loss == "auto":
             trainable = bool(encoder) and isinstance(self.replay_buffer, WindowReplayBuffer)
-            name = "aarl-pixel" if image_spaces(self.observation_space) else "aarl-state"
+            name = "aarl-pixel" if self.policy.image_keys else "aarl-state"
             self.aux_loss = catalog.load(name) if trainable else None
             if self.verbose >= 1:
                 print(f"Auxiliary loss: {name if trainable else 'none'}")
@@ -355,9 +359,11 @@ class SACAux(SAC):
             self.critic.optimizer = self.policy.make_optimizer(self._q_parameters(self.critic), self.lr_schedule)
 
     def _schedule(self, learning_rate: float | Schedule | None) -> Schedule:
-        if learning_rate is None:
-            return lambda progress_remaining: self.lr_schedule(progress_remaining)
-        return FloatSchedule(learning_rate)
+        return self._learning_rate if learning_rate is None else FloatSchedule(learning_rate)
+
+    def _learning_rate(self, progress_remaining: float) -> float:
+        # A method, so that copies of the model follow their own schedule.
+        return self.lr_schedule(progress_remaining)
 
     @staticmethod
     def _q_parameters(critic: Critic) -> list[th.nn.Parameter]:
@@ -542,7 +548,7 @@ class SACAux(SAC):
             actor_loss = (ent_coef * log_prob - min_q).mean()
             log("actor_loss", actor_loss)
             self.actor.optimizer.zero_grad()
-            actor_loss.backward(inputs=self.actor.own_parameters())
+            actor_loss.backward(inputs=[parameter for parameter in self.actor.own_parameters() if parameter.requires_grad])
             self.actor.optimizer.step()
 
         # Target critic, its encoder being the momentum encoder.
@@ -644,9 +650,10 @@ class SACAux(SAC):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfSACAux:
-        # A loaded model goes on with the random numbers that it was saved with.
-        if self._random_state is not None and not reset_num_timesteps:
-            self._set_random_state(self._random_state)
+        # A loaded model goes on with the random numbers that it was saved with, unless it was given another seed.
+        state = self._random_state
+        if state is not None and not reset_num_timesteps and state.get("seed", self.seed) == self.seed:
+            self._set_random_state(state)
         self._random_state = None
         try:
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
@@ -657,8 +664,19 @@ class SACAux(SAC):
                 raise
             raise NonFiniteError(f"{culprit} is not finite at {self._step_and_loss(self._n_updates)}") from error
 
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        As in SB3; a loaded model does not go on with the random numbers that it was saved with then.
+
+        :param seed: The seed, None to leave everything as it is
+        """
+        super().set_random_seed(seed)
+        if seed is not None:
+            self._random_state = None
+
     def _get_random_state(self) -> dict[str, Any]:
         return {
+            "seed": self.seed,
             "python": random.getstate(),
             "numpy": np.random.get_state(),
             "torch": th.get_rng_state(),
@@ -722,7 +740,9 @@ class SACAux(SAC):
         :param device: Device of the parameters
         :raises RuntimeError: when they hold an auxiliary loss and this model has none
         """
-        if isinstance(load_path_or_dict, dict) and ("aux_head" in load_path_or_dict) > (self.aux_head is not None):
+        if not isinstance(load_path_or_dict, dict):
+            load_path_or_dict = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
+        if ("aux_head" in load_path_or_dict) > (self.aux_head is not None):
             # Not a ValueError, which SB3's load() takes for a DQN of an old version.
             raise RuntimeError(
                 "these parameters are of a model with an auxiliary loss, this one has none: load it with its own, and make a "

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import DummyVecEnv, VecExtractDictObs, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, detect_frame_stack
 
@@ -567,10 +567,21 @@ def test_a_reset_by_hand_begins_a_new_episode(stack):
         assert_same(obs, steps[-1].next_obs)
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float64, np.int64])
+@pytest.mark.parametrize("dtype", [np.float16, np.float64, np.int64, np.uint16])
 def test_other_data_types(dtype):
     buffer = make_buffer(20, 2, stack=2, dtype=dtype)
     check_windows(buffer, filled(buffer, 33, LIFE, stack=2, padding="zeros", dtype=dtype), 3)
+
+
+def test_an_array_of_ends_may_be_used_again():
+    buffer, done = WindowReplayBuffer(20, VECTOR, ACTIONS, "cpu"), np.zeros(1, bool)
+    for t in range(6):
+        done[:] = t == 2
+        obs = np.full((1, *VECTOR.shape), 10 * (t > 2) + t, np.float32)
+        buffer.add(obs, obs + 1, np.zeros((1, 2)), np.zeros(1), done, [{}])
+        done[:] = False
+    assert buffer.dones[:6, 0].tolist() == [0, 0, 1, 0, 0, 0] and not buffer.timeouts.any()
+    assert buffer._age[:6, 0].tolist() == [0, 1, 2, 0, 1, 2]
 
 
 def test_nan_is_no_new_episode():
@@ -643,6 +654,8 @@ BOTH = spaces.Dict({"image": IMAGE, "state": VECTOR, "table": TABLE})
             {"image": 2, "state": 2, "table": 1},
         ),
         (lambda: DummyVecEnv([lambda: Shown(BOTH)]), {"image": 1, "state": 1, "table": 1}),
+        # What is taken out has no key any more.
+        (lambda: VecExtractDictObs(VecFrameStack(DummyVecEnv([lambda: Shown(BOTH)]), 2), "state"), 1),
     ],
 )
 def test_detected_stacks_fit_what_the_wrappers_give(make_env, expected):

@@ -80,6 +80,16 @@ def test_evaluates_at_the_checkpoints(n_envs: int, action_repeat: int, checkpoin
     assert all(evaluation.episodes == 2 for evaluation in told)
 
 
+def test_seconds_go_on_where_training_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(0, 10**6, 10))
+    monkeypatch.setattr("sb3_aarl.callbacks.time.monotonic", lambda: float(next(clock)))
+    model, callback = make_model(Walk()), LearningCurveCallback(Walk(), [10, 20], 1)
+    model.learn(10, callback)
+    next(clock)  # between trainings it does not count
+    model.learn(10, callback, reset_num_timesteps=False)
+    assert [point.seconds for point in callback.curve] == [10.0, 20.0]
+
+
 def play(model: SACAux, env: gym.Env, seed: int) -> tuple[float, int]:
     """Return and length of the deterministic episode with a seed."""
     observation, _ = env.reset(seed=seed)

@@ -773,6 +773,25 @@ def test_seeds(kind: str) -> None:
     assert not th.equal(first.critic.q_networks[0][0].weight, other.critic.q_networks[0][0].weight)
 
 
+def test_a_loaded_model_takes_another_seed(tmp_path: pathlib.Path) -> None:
+    model = make_model().learn(30)
+    model.save(tmp_path / "model")
+
+    def go_on(seed_at_load: int | None, seed_after: int | None) -> np.ndarray:
+        kwargs = {} if seed_at_load is None else {"seed": seed_at_load}
+        loaded = SACAux.load(tmp_path / "model", make_env("state"), device="cpu", **kwargs)
+        if seed_after is not None:
+            loaded.set_random_seed(seed_after)
+        loaded.learn(10, reset_num_timesteps=False)
+        return loaded.replay_buffer.actions[:10].copy()
+
+    plain, again, same = go_on(None, None), go_on(None, None), go_on(model.seed, None)
+    assert np.array_equal(plain, again) and np.array_equal(plain, same)
+    others = [go_on(1, None), go_on(2, None), go_on(None, 1), go_on(None, 5)]
+    assert len({actions.tobytes() for actions in [plain, *others[:2]]}) == 3
+    assert len({actions.tobytes() for actions in [plain, *others[2:]]}) == 3
+
+
 @pytest.mark.parametrize("kind", ["pixels", "dict"])
 def test_prediction_sees_the_centre_and_training_sees_any_crop(kind: str) -> None:
     model = filled_model(kind, crop_size=16, augmentation="random_crop")
@@ -867,6 +886,53 @@ def test_loading_without_the_auxiliary_loss_says_what_is_wrong(tmp_path: pathlib
     make_model("state").save(tmp_path / "model")
     with pytest.raises(RuntimeError, match="of a model with an auxiliary loss"):
         SACAux.load(tmp_path / "model", aux_loss=None)
+    plain = make_model("state", aux_loss=None)
+    before = everything(plain)
+    with pytest.raises(RuntimeError, match="of a model with an auxiliary loss"):
+        plain.set_parameters(str(tmp_path / "model"))
+    assert_same(everything(plain), before)
+    other = make_model("state", seed=9)
+    other.set_parameters(str(tmp_path / "model"))
+    assert_same(other.get_parameters(), SACAux.load(tmp_path / "model").get_parameters())
+
+
+def test_a_part_of_the_actor_may_be_frozen() -> None:
+    model = make_model("state", policy_kwargs={"share_features_extractor": False})
+    model.actor.features_extractor.requires_grad_(False)
+    before = everything(model)
+    model.learn(40)
+    after = everything(model)
+    frozen = [name for name in after if name.startswith("policy.actor.features_extractor")]
+    assert frozen and all(th.equal(before[name], after[name]) for name in frozen)
+    assert not th.equal(before["policy.actor.mu.weight"], after["policy.actor.mu.weight"])
+
+
+def test_what_is_found_out_of_the_wrappers_is_found_out_again(tmp_path: pathlib.Path) -> None:
+    stacked = make_model(env=VecFrameStack(make_env("state"), 2)).learn(30)
+    assert stacked.replay_buffer.stores[""].stack == 2 and "frame_stack" not in stacked.replay_buffer_kwargs
+    stacked.save(tmp_path / "model")
+    assert SACAux.load(tmp_path / "model").replay_buffer.stores[""].stack == 2  # there are no wrappers to look at
+
+    class Wide(gym.ObservationWrapper):
+        """As many numbers, which are no stack."""
+
+        observation_space = stacked.observation_space
+
+        def observation(self, observation: np.ndarray) -> np.ndarray:
+            return np.concatenate([observation, observation**2])
+
+    env = DummyVecEnv([lambda: Wide(Point())])
+    model = SACAux.load(tmp_path / "model", env)
+    assert model.replay_buffer.stores[""].stack == 1
+    model.learn(30)
+
+
+def test_a_copy_follows_its_own_learning_rate() -> None:
+    model = make_model(encoder_learning_rate=None)
+    other = copy.deepcopy(model)
+    other.lr_schedule = lambda _: 0.25
+    other.learn(30)
+    assert other.aux_optimizer is not None and other.aux_optimizer.param_groups[0]["lr"] == 0.25
 
 
 def test_a_frame_stack_that_observations_are_not() -> None:
@@ -965,3 +1031,18 @@ def test_auto_is_the_papers_loss(kind: str, name: str, capsys: pytest.CaptureFix
     assert f"Auxiliary loss: {name}\n" in capsys.readouterr().out
     identity = {"features_extractor_class": "identity", "features_extractor_kwargs": {}}
     assert make_model("state", aux_loss="auto", policy_kwargs=identity).aux_loss is None
+
+
+class Frozen(FlattenExtractor):
+    """Has parameters, of which none learns."""
+
+    def __init__(self, space: spaces.Space):
+        super().__init__(space)
+        self.scale = th.nn.Parameter(th.ones(()), requires_grad=False)
+
+
+def test_auto_is_nothing_where_nothing_learns() -> None:
+    frozen = {"features_extractor_class": Frozen, "features_extractor_kwargs": {}}
+    assert make_model("state", aux_loss="auto", policy_kwargs=frozen).aux_loss is None
+    with pytest.raises(ValueError, match="Frozen has no parameters that the auxiliary loss could train"):
+        make_model("state", policy_kwargs=frozen)

@@ -18,7 +18,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 from torch import nn
 
-from sb3_aarl import SACAux
+from sb3_aarl import SACAux, catalog
 
 FORWARD_DYNAMICS = "{s_t, a_t} -> {s_t+1}"
 EPISODE = 7
@@ -459,6 +459,26 @@ def test_normalize_images(space: spaces.Box, normalize: bool, largest: float) ->
 def test_what_is_no_image_is_refused(space: spaces.Space) -> None:
     with pytest.raises(AssertionError, match="normalize_images=False"):
         make_model(RandomEnv(space), "CnnPolicy")
+
+
+@pytest.mark.parametrize(("augmentation", "size"), [("auto", 84), ("random_crop", 84), ("random_shift", 100), ("none", 100)])
+def test_float_images_are_augmented_too(augmentation: str, size: int) -> None:
+    kwargs = {"normalize_images": False, "features_extractor_kwargs": SMALL_CNN}
+    env = RandomEnv(spaces.Box(0, 1, (1, 100, 100)))
+    model = make_model(env, "CnnPolicy", kwargs, augmentation=augmentation, aux_loss="auto")
+    assert model.aux_loss == catalog.load("aarl-pixel")
+    images = th.rand(4, 1, 100, 100)
+    augmented = model.policy.augment(images)
+    assert augmented.shape[2:] == (size, size) and th.equal(augmented, images) == (augmentation == "none")
+    small = RandomEnv(spaces.Box(0, 1, (1, 40, 40)))
+    with pytest.raises(ValueError, match="40 x 40 pixels are smaller than the crop"):
+        make_model(small, "CnnPolicy", kwargs, augmentation="random_crop")
+
+
+def test_normalized_vectors_of_whole_numbers_that_are_stacked() -> None:
+    env = VecFrameStack(DummyVecEnv([lambda: RandomEnv(spaces.Box(0, 255, (5,), np.uint8))]), 2)
+    model = make_model(VecNormalize(env)).learn(60)
+    assert model.replay_buffer.stores[""].stack == 2 and model.replay_buffer.dones[:60].sum() > 1
 
 
 def test_float_images_of_a_dict() -> None:
