@@ -207,7 +207,8 @@ class AuxLoss:
 
 
 # Configurations are plain YAML: a loss is written as a mapping, never as a Python object.
-for _dumper in (yaml.SafeDumper, yaml.Dumper):
+_C_DUMPERS = [getattr(yaml, name) for name in ("CSafeDumper", "CDumper") if hasattr(yaml, name)]
+for _dumper in (yaml.SafeDumper, yaml.Dumper, *_C_DUMPERS):
     _dumper.add_representer(AuxLoss, lambda dumper, loss: dumper.represent_dict(loss.to_dict()))
 
 

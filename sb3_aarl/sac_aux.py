@@ -58,7 +58,7 @@ class SACAux(SAC):
     unless another source is named; what differs there between tasks has the value of most tasks.
 
     :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
-    :param env: The environment, or its registered name
+    :param env: The environment, or its registered name (those of DeepMind Control once ``sb3_aarl.envs`` is imported)
     :param learning_rate: Of actor and critic, may be a schedule (1e-3; 2e-4 for Cheetah-Run)
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts
@@ -115,6 +115,9 @@ class SACAux(SAC):
     :param allow_tf32: Whether float32 products and convolutions of the gradient step may use TF32 on a GPU; None for
         PyTorch's own settings (convolutions only)
     :raises ValueError: for arguments that do not fit, with the culprit's name
+
+    Training stops with :class:`NonFiniteError` where something is NaN or infinite, and with
+    :class:`ExplodedError` where Q values are far beyond all that the rewards so far allow.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

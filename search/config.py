@@ -421,6 +421,8 @@ def _convert(value: Any, hint: Any, where: str, folder: Path) -> Any:
     if kind in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
+        if value == "auto" and {AuxLoss, str} <= {*arguments}:  # SACAux chooses
+            return value
         nested = [argument for argument in arguments if argument is AuxLoss or is_dataclass(argument)]
         for argument in nested or arguments:
             if nested:

@@ -60,13 +60,14 @@ def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     The candidates by their mean AULC over all environments (paper, A.4), the best first.
 
     :param runs: As :func:`search.grid.scores` gives them
-    :return: One row a candidate: mean score on each environment, then ``mean`` and sample deviation
-        ``std`` over all runs, and ``runs``
+    :return: One row a candidate: mean score on each environment, then ``mean``, ``std`` (sample deviation
+        over seeds of the mean over environments), and ``runs``
     """
     by_environment = runs.pivot_table(index="variant", columns="environment", values="score", aggfunc="mean")
-    by_variant = runs.groupby("variant")["score"]
+    of_seeds = runs.groupby(["variant", "seed"])["score"].mean().groupby("variant")
     # The mean of the environments' means: each counts alike, however many seeds it has so far.
-    overall = pd.DataFrame({"mean": by_environment.mean(axis=1), "std": by_variant.std(), "runs": by_variant.count()})
+    overall = pd.DataFrame({"mean": by_environment.mean(axis=1), "std": of_seeds.std()})
+    overall["runs"] = runs.groupby("variant")["score"].count()
     return by_environment.join(overall).sort_values("mean", ascending=False)
 
 

@@ -209,10 +209,12 @@ class AuxLossSampler(BaseGASampler):
     :param max_horizon: Longest horizon (paper: 10)
     :param operators: Operators to search too, as in ``suggest_aux_loss``; None for mean squared error (paper, 2.2)
     :param allow_duplicates: Whether a loss may be trained again, as in the paper; else a candidate whose canonical
-        form the search had already is drawn again. Candidates in place of failed ones may still, rarely, repeat each other
+        form the search had already is drawn again. Candidates in place of failed ones may still, rarely, repeat each other,
+        and what is planned may repeat a loss that the user enqueued in the same stage
     :param seed: Seed of the evolution, not negative. None for a random one, kept in the study; a study keeps its first seed
     :param screening: Offspring that are drawn for each place, of which the one is kept that a Bayesian linear model of
-        the tokens, fitted to the stages before, rates highest under one posterior draw; 1 for the paper's evolution
+        the tokens, fitted to the stages that are complete, rates highest under one posterior draw; 1 for the paper's
+        evolution. The first stage has no model yet, and what replaces a failed random loss is not screened
     :param retries: How often a candidate is given out again after its worker died, before it is taken for the cause
     :param n_stages: Number of stages, after which ``ask`` raises :class:`SearchComplete`; None for no end
     :param worker: Identity that each trial shows as its worker's; ``"auto"`` for that of the process that asks

@@ -60,8 +60,9 @@ def test_value_semantics(loss: AuxLoss) -> None:
     assert twin == loss and hash(twin) == hash(loss) and len({twin, loss}) == 1
     assert pickle.loads(pickle.dumps(loss)) == loss
     assert AuxLoss.from_dict(loss.to_dict()) == loss
-    for dump in (yaml.safe_dump, yaml.dump):
-        assert AuxLoss.from_dict(yaml.safe_load(dump({"aux_loss": loss}))["aux_loss"]) == loss
+    for name in ("SafeDumper", "Dumper", "CSafeDumper", "CDumper"):
+        text = yaml.dump({"aux_loss": loss}, Dumper=getattr(yaml, name, yaml.Dumper))
+        assert AuxLoss.from_dict(yaml.safe_load(text)["aux_loss"]) == loss
     with pytest.raises(dataclasses.FrozenInstanceError):
         loss.horizon = 1  # type: ignore[misc]
     for field, value in (("negatives", not loss.negatives), ("operator", "mse" if loss.operator != "mse" else "inner")):

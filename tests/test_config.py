@@ -310,6 +310,12 @@ def test_files_that_are_not_plain_are_refused_and_execute_nothing(tmp_path: Path
     assert not marker.exists()
 
 
+def test_auto_is_a_loss_of_hyperparameters(tmp_path: Path) -> None:
+    path = write(tmp_path, CONFIG, {"default": {"aux_loss": "auto"}})
+    load_config(path)
+    assert load_hyperparameters(tmp_path / "hyper.yml", "Pendulum-v1") == {"aux_loss": "auto"}
+
+
 def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path)
     path.write_bytes(b"\xff\xfe\x00stages: 1")

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import optuna
 import pandas as pd
 import pytest
@@ -14,7 +15,7 @@ from optuna.trial import TrialState
 from optuna_dashboard._note import get_note_from_system_attrs
 
 from sb3_aarl import catalog
-from search import evolve, grid, operator_selection, workers
+from search import cross_validation, evolve, grid, operator_selection, workers
 from search.config import CrossValidation, SearchConfig
 from search.storage import load_study, open_storage
 
@@ -232,6 +233,15 @@ def test_normalized_returns_rank_the_higher_one_first(
     assert list(table.index) == list(expected)
     for variant, numbers in expected.items():
         assert tuple(table.loc[variant, ["mean", "std"]]) == pytest.approx(numbers)
+
+
+def test_a_ranking_deviates_over_seeds_not_over_environments() -> None:
+    scores = {("x", 0): 99.0, ("x", 1): 101.0, ("y", 0): 899.0, ("y", 1): 905.0}
+    rows = [("a", environment, seed, score) for (environment, seed), score in scores.items()]
+    table = cross_validation.ranking(pd.DataFrame(rows, columns=["variant", "environment", "seed", "score"]))
+    row = table.loc["a"]
+    assert (row["x"], row["y"], row["mean"], row["runs"]) == (100.0, 902.0, 501.0, 4)
+    assert row["std"] == pytest.approx(np.std([499.0, 503.0], ddof=1))
 
 
 def test_scores_are_those_of_the_runs_asked_for(tmp_path: Path) -> None:

@@ -246,7 +246,7 @@ def test_what_other_studies_of_the_storage_add(study, tmp_path):
     page = read_page(tmp_path / "report.html")
     rows = table_after(page, "Cross-validation")
     assert [row[0].endswith(loss) for row, loss in zip(rows, losses[1::-1], strict=True)] == [True, True]
-    assert [row[1:] for row in rows] == [["10.5", "10.5", "10.5", "0.6", "4"], ["0.5", "0.5", "0.5", "0.6", "4"]]
+    assert [row[1:] for row in rows] == [["10.5", "10.5", "10.5", "0.7", "4"], ["0.5", "0.5", "0.5", "0.7", "4"]]
     assert "1 without all runs are left out." in " ".join(page.text_content().split())
     write_report(study, tmp_path / "report.html", validation=stored_runs(storage, "nothing"))
     assert "Cross-validation" not in read_page(tmp_path / "report.html").text_content()
