@@ -114,12 +114,13 @@ def printed_table(folder: Path) -> str:
 
 def paper(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
     """
-    What the paper has on the same tasks at the same steps, where no variant is one of its own (else it is in the table).
+    What the paper has on the same tasks at the same steps, where no variant is one of its own (else it is in the table), and
+    what the public code gave there.
 
     :param abouts: What stands beside the curves
     """
-    if closest_table(about["variant"] for about in abouts) is not None:
-        return
+    abouts = list(abouts)
+    is_there = closest_table(about["variant"] for about in abouts) is not None
     asked_for = [
         (TABLES[about["hyperparameters"]["policy"]], step, about["environment"])
         for about in abouts
@@ -129,7 +130,7 @@ def paper(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
     for number, step, environment in dict.fromkeys(asked_for):
         scores = paper_scores(number).query("checkpoint == @step and environment == @environment")
         cells = [f"{row.column} {row.mean:.0f} ± {row.std:.0f}" for row in scores.itertuples()]
-        if cells:
+        if cells and not is_there:
             runs = scores["runs"].iloc[0]
             yield f"The paper's table {number}, {task_name(environment)} at {step:,}, {runs} runs: {', '.join(cells)}.\n"
         if number == 4 and (environment, step) in REFERENCE:

@@ -30,6 +30,8 @@ STANDARD_ERRORS = 2.0
 MARKS = {"higher": "▲", "lower": "▼", "": ""}
 # The row of table 6, which has no environments.
 NORMALIZED = "normalized"
+# Of the name of a variant whose networks compute in bfloat16.
+BF16 = "_bf16"
 # Tasks whose returns are on one scale, 0 to 1000.
 SUITE = "DeepMind Control"
 
@@ -61,13 +63,22 @@ def paper_scores(number: int) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["checkpoint", "environment", "column", "variant", "mean", "std", "runs"])
 
 
+def paper_variant(variant: str) -> str:
+    """
+    Which of the paper's variants one is: computed in bfloat16 it is the same one.
+
+    :param variant: Its name
+    """
+    return variant.removesuffix(BF16)
+
+
 def closest_table(variants: Iterable[str]) -> int | None:
     """
     The paper's table with the most of some variants, None if none has any.
 
     :param variants: Names of variants
     """
-    names = set(variants)
+    names = set(map(paper_variant, variants))
     matches = {number: len(names & set(table["columns"].values())) for number, table in _paper().items()}
     best = max(matches, key=lambda number: matches[number])
     return best if matches[best] else None
@@ -136,6 +147,7 @@ def in_order(runs: pd.DataFrame, number: int | None) -> pd.DataFrame:
     places = {}
     for key in ("environment", "variant"):
         of_paper = paper_scores(number)[key].dropna().tolist() if number is not None else []
+        of_paper = [name + suffix for name in of_paper for suffix in ("", BF16)]
         names = dict.fromkeys(of_paper + sorted(runs[key]))
         places[key] = {name: place for place, name in enumerate(names)}
     keys = ["checkpoint", "environment", "variant", "seed"]
@@ -172,11 +184,14 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
         paper = paper_scores(number).rename(columns={name: f"paper_{name}" for name in ("mean", "std", "runs")})
         names = dict(zip(paper["variant"], paper["column"], strict=True))
     numbers = dict.fromkeys(columns[-3:], float)
-    result = result.merge(paper.drop(columns="column").astype(numbers), on=keys, how="left")
+    result["paper_variant"] = result["variant"].map(paper_variant)
+    paper = paper.drop(columns="column").astype(numbers).rename(columns={"variant": "paper_variant"})
+    result = result.merge(paper, on=[*keys[:2], "paper_variant"], how="left")
     for _, part in result.groupby("checkpoint"):
         if not _is_comparable(part):
             result.loc[part.index, list(numbers)] = math.nan
-    result["column"] = [names.get(variant, variant) for variant in result["variant"]]
+    same = zip(result["paper_variant"], result["variant"], strict=True)
+    result["column"] = [names.get(of_paper, variant) for of_paper, variant in same]
     result["difference"] = result["mean"] - result["paper_mean"]
     variance = result["std"] ** 2 / result["runs"] + result["paper_std"] ** 2 / result["paper_runs"]
     result["standard_error"] = np.sqrt(variance)
@@ -187,9 +202,9 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
 
 def _is_comparable(comparison: pd.DataFrame) -> bool:
     """Whether the scores of a checkpoint can be compared with the paper's: not if they are normalized by other variants."""
-    of_paper = set(_paper()[6]["columns"].values())
+    of_paper = _paper()[6]["columns"].values()
     is_normalized = (comparison["environment"] == NORMALIZED).any()
-    return not is_normalized or set(comparison.dropna(subset="mean")["variant"]) == of_paper
+    return not is_normalized or sorted(map(paper_variant, comparison.dropna(subset="mean")["variant"])) == sorted(of_paper)
 
 
 def _by_task(runs: pd.DataFrame) -> pd.DataFrame:

@@ -297,6 +297,18 @@ def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
     assert table.compare(table.read_runs(tmp_path), 6)["paper_mean"].count() == 0
 
 
+def test_variants_in_bfloat16_stand_beside_the_papers(tmp_path: Path) -> None:
+    variants = ["aarl_state_bf16_joint", "sac_dense_mlp_bf16", "aarl_state_bf16", "aarl_state"]
+    plant_scores(tmp_path, {(name, CHEETAH): np.array([200.0, 210.0, 220.0]) for name in variants})
+    runs = table.read_runs(tmp_path)
+    assert table.closest_table(["aarl_state_bf16"]) == 4 and table.closest_table(["aarl_state_bf16_joint"]) is None
+    result = table.compare(table.in_order(runs, 4), 4).set_index("variant")
+    assert list(result.index) == ["aarl_state", "aarl_state_bf16", "sac_dense_mlp_bf16", "aarl_state_bf16_joint"]
+    assert result["column"].tolist() == ["AARL-State", "AARL-State", "SAC", "aarl_state_bf16_joint"]
+    assert result["paper_mean"].iloc[:3].tolist() == [472.0, 472.0, 172.0] and math.isnan(result["paper_mean"].iloc[3])
+    assert result["mark"].tolist() == ["lower", "lower", "higher", ""]
+
+
 def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
     steps = (100_000, 500_000)
     for seed in range(3):
