@@ -6,6 +6,7 @@ whole stages pass: the first asks of a stage, with the choice of parents and the
 """
 
 import argparse
+import gc
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +28,7 @@ SAMPLERS: dict[str, Callable[[], BaseSampler]] = {
 
 def measure(sampler: BaseSampler, sizes: list[int], n_asks: int) -> list[dict[str, float]]:
     """Median and maximum at each size, in milliseconds; also the maximum of processor time, which other processes spare."""
+    gc.collect()  # the study before has many objects: not in the middle of this one
     study = optuna.create_study(direction="maximize", sampler=sampler)
     rng = np.random.default_rng(0)
     seconds: list[tuple[float, float]] = []

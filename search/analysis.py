@@ -361,7 +361,7 @@ def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = St
     table = trial_table(sorted(line, key=lambda trial: -trial.number))
     scores = table.set_index("number")["score"]
     reduce = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
-    parents = [reduce(scores[of]) if of else np.nan for of in table["parents"]]
+    parents = [reduce(scores.reindex(of)) if of else np.nan for of in table["parents"]]
     return table.assign(gain=table["score"] - np.array(parents, dtype=float))
 
 

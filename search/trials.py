@@ -87,7 +87,7 @@ def lineage(trial: FrozenTrial, trials: Sequence[FrozenTrial]) -> list[FrozenTri
     stack = parents_of(trial)[::-1]
     while stack:
         number = stack.pop()
-        if number not in ancestors and number < len(trials):
+        if number not in ancestors and number != trial.number and number < len(trials):
             ancestors[number] = trials[number]
             stack.extend(parents_of(trials[number])[::-1])
     return list(ancestors.values())

@@ -259,7 +259,7 @@ def test_environments_in_processes_of_their_own_are_the_same_run(learned: list[S
     one, other = learned
     assert one._n_updates == other._n_updates == 10
     assert all(value.equal(other.policy.state_dict()[key]) for key, value in one.policy.state_dict().items())
-    assert one.replay_buffer_kwargs == other.replay_buffer_kwargs == {"frame_stack": 2}
+    assert one._frame_stack == other._frame_stack == 2
 
 
 def test_an_interruption_stays_one_where_the_processes_of_environments_are_gone() -> None:

@@ -153,8 +153,12 @@ def test_lineage_reaches_every_ancestor_and_the_first_line_first():
 
 
 def test_lineage_of_nonsense():
-    trials = make_trials(make_trial(1.0, parents=[0, 1, -1, "x", None]), make_trial(1.0, parents="0"))
+    trials = make_trials(make_trial(1.0, parents=[0, 5, -1, "x", None]), make_trial(1.0, parents="0"))
     assert [lineage(trial, trials) for trial in trials] == [[], []]
+    # A loop, and a parent that has the higher number: its child waited for its place meanwhile.
+    trials = make_trials(make_trial(1.0, parents=[1]), make_trial(2.0, parents=[0]), make_trial(3.0, parents=[1, 9]))
+    assert [[ancestor.number for ancestor in lineage(trial, trials)] for trial in trials] == [[1], [0], [1, 0]]
+    assert analysis.winner_lineage(trials)["gain"].tolist() == [1.0, 1.0, -1.0]
 
 
 def texts(figure):
