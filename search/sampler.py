@@ -433,15 +433,13 @@ class AuxLossSampler(BaseGASampler):
 
     def _refresh(self, study: Study) -> None:
         storage, study_id = study._storage, study._study_id
-        if self._study is None or self._study[0] is not storage or self._study[1] != study_id:
-            self._check_settings(study)
-            self._study = (storage, study_id)
-            self._register = _Register(self.operations)
-            self._evolution = None
         # Not study.get_trials: a pruner may have wrapped the study so that it shows some of the trials only.
         trials = storage.get_all_trials(study_id, deepcopy=False)
-        if _is_another(trials, self._register.trials):  # SQLite gives the number of a deleted study to the next one
+        is_known = self._study is not None and self._study[0] is storage and self._study[1] == study_id
+        # SQLite gives the number of a deleted study to the next one.
+        if not is_known or _is_another(trials, self._register.trials):
             self._check_settings(study)
+            self._study = (storage, study_id)
             self._register = _Register(self.operations)
             self._evolution = None
         self._register.refresh(trials)
@@ -521,14 +519,15 @@ class AuxLossSampler(BaseGASampler):
         """Take a place for a trial; False if another one has it too."""
         evolution = self._get_evolution(study)
         attempt = self._register.attempt(stage, place, self.retries)
-        operation, parents, loss = "enqueued", [], None
+        operation, loss = "enqueued", None
+        parents: list[int] = []
         left_over = None if is_given else self._register.enqueued(stage, place, self.retries)
         if not is_given and left_over is None:
             candidate = evolution.candidate(stage, place, attempt)
             operation, parents, loss = candidate.operation, list(candidate.parents), str(candidate.loss)
         storage, trial_id = study._storage, trial._trial_id
-        claim: dict[str, Any] = {"stage": stage, "place": place, "attempt": attempt, "seed": evolution.seed, "loss": loss}
-        claim |= {"operation": operation, "parents": parents}
+        drawn = {"loss": loss, "operation": operation, "parents": parents}
+        claim = {"stage": stage, "place": place, "attempt": attempt, "seed": evolution.seed, **drawn}
         storage.set_trial_system_attr(trial_id, PLACE_KEY, claim)
         # Others may have seen other trials without a place, and choose the same one at this moment. So everybody looks back,
         # and gives way if he is not alone: one of two, at least, sees the other.
