@@ -289,8 +289,8 @@ class SACAuxPolicy(SACPolicy):
         images must not be smaller
     :param squash_log_std: None (default, SB3): the log standard deviation is clipped to [-20, 2]. Bounds such as
         (-10, 2) (the public reference): tanh squashes it into them; gSDE, whose scale is no network's, ignores them
-    :param ortho_init: Whether the hidden layers of actor and critic start orthogonal with zero biases (CURL, the
-        reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
+    :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases
+        (CURL, the reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
     :param kwargs: activation_fn, use_sde, log_std_init, use_expln, clip_mean, normalize_images, optimizer_class,
         optimizer_kwargs and n_critics of SB3's SACPolicy
     """

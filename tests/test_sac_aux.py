@@ -689,6 +689,20 @@ def test_a_saved_model_goes_on_as_if_it_had_not_stopped(
         assert_same(getattr(resumed.replay_buffer, name), getattr(straight.replay_buffer, name))
 
 
+@pytest.mark.parametrize("ortho_init", [False, True])
+def test_ortho_init_reaches_every_linear_layer(ortho_init: bool) -> None:
+    policy = make_model(policy_kwargs={"ortho_init": ortho_init}).policy
+    for part in (policy.actor, policy.critic):
+        for name, module in part.named_modules():
+            if isinstance(module, th.nn.Linear):
+                short = module.weight if module.weight.shape[0] <= module.weight.shape[1] else module.weight.T
+                orthogonal = th.allclose(short @ short.T, th.eye(len(short)), atol=1e-4)
+                encoder = "features_extractor" in name or name == "projection" or name.startswith("projection.")
+                # A single output is orthogonal as soon as its weights have length one.
+                assert (orthogonal and not module.bias.any()) == (ortho_init or encoder), name
+    assert_same(policy.critic_target.state_dict(), policy.critic.state_dict())
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("share", [True, False])
 def test_a_loaded_model_predicts_equally_without_an_env(kind: str, share: bool, tmp_path: pathlib.Path) -> None:

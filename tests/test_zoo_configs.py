@@ -165,6 +165,11 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "curl_state_bf16": ("curl_state", {"precision": "bf16"}),
     "sac_dense_mlp_bf16": ("sac_dense_mlp", {"precision": "bf16"}),
     "sac_identity_bf16": ("sac_identity", {"precision": "bf16"}),
+    "sac_identity_bf16_orthogonal": ("sac_identity", {"precision": "bf16", "policy_kwargs": {"ortho_init": True}}),
+    "sac_identity_bf16_orthogonal_squashed": (
+        "sac_identity",
+        {"precision": "bf16", "policy_kwargs": {"ortho_init": True, "squash_log_std": (-10, 2)}},
+    ),
 }
 
 
