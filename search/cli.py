@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,6 +17,8 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
+
+from search.passwords import storage_name, without_password
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,18 +62,18 @@ def clear_errors() -> Iterator[None]:
 
 
 def _one_line(error: Exception) -> str | None:
-    """What a user is told of an error that he can mend; None for others."""
+    """What a user is told of an error that he can mend, without passwords; None for others."""
     from search.training import TrainingError
 
     if isinstance(error, (ValueError, OSError, TrainingError)):
-        return " ".join(str(error).split())
+        return without_password(" ".join(str(error).split()))
     if "search.pool" in sys.modules:  # else it is not of Optuna, which a training alone does without
         from optuna.exceptions import StorageInternalError
 
         from search.pool import WorkerError, message
 
         if isinstance(error, WorkerError):
-            return " ".join(str(error).split())
+            return without_password(" ".join(str(error).split()))
         if isinstance(error, StorageInternalError):
             return message(error)
     return None
@@ -197,7 +200,6 @@ def search(
 
         from search import evolve
         from search.config import load_config
-        from search.passwords import storage_name
         from search.pool import WorkerPool
 
         changes: dict[str, Any] = {"stages": stages, "pruner": pruner}
@@ -254,7 +256,6 @@ def worker(
         from functools import partial
 
         from search import evolve
-        from search.passwords import storage_name
         from search.pool import WorkerPool
 
         console.print(f"Working for {storage_name(storage)}", soft_wrap=True, markup=False)
@@ -565,15 +566,15 @@ def dashboard(
     """Watch a search in optuna-dashboard."""
     with clear_errors():
         from search.dashboard import ARTIFACTS, serve, update_plots
-        from search.evolve import CONFIG_KEY
+        from search.evolve import is_search
         from search.report import stored_baselines
         from search.storage import load_study, open_storage
 
         folder = _search_folder(folder, storage)
         opened = open_storage(storage or str(folder), create=False)
         for found in opened.get_all_studies():
-            if CONFIG_KEY in found.user_attrs:  # a search that was interrupted has an old plot
-                name = found.study_name
+            name = found.study_name
+            if is_search(load_study(opened, name)):  # one that was interrupted has an old plot
                 update_plots(load_study(opened, name), stored_baselines(opened, name))
         console.print(f"http://{host}:{port}/  (Ctrl-C to stop)", highlight=False)
         serve(opened, (folder or Path("runs")) / ARTIFACTS, host, port)
@@ -872,6 +873,15 @@ def _search_folder(run: Path | None, storage: str | None, benchmarks: bool = Tru
 
 def main() -> None:
     """Run the program."""
+    for before, argument in pairwise(sys.argv):
+        # Refused here: what does not fit is repeated in error messages.
+        if (
+            "://" in argument
+            and storage_name(argument) != argument
+            and not (before == "--storage" or argument.startswith("--storage="))
+        ):
+            errors.print(f"Error: {storage_name(argument)}: a storage goes behind --storage", style="red", markup=False)
+            sys.exit(2)
     app()
 
 

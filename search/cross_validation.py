@@ -8,6 +8,7 @@ import pandas as pd
 import yaml
 
 from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.callbacks import replace_text
 from search.config import ConfigError, SearchConfig
 from search.grid import Grid, Variant
 from search.trials import loss_of, ranked
@@ -81,7 +82,6 @@ def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
     """
     winner = AuxLoss.parse(str(table.index[0]))
     score = {"mean_aulc": round(float(table["mean"].iloc[0]), 3), "runs": int(table["runs"].iloc[0])}
-    path.parent.mkdir(parents=True, exist_ok=True)
     comment = f"# Best of {len(table)} candidates in cross-validation: {score}\n"
-    path.write_text(comment + yaml.safe_dump({"aux_loss": winner}, sort_keys=False), encoding="utf-8")
+    replace_text(path, comment + yaml.safe_dump({"aux_loss": winner}, sort_keys=False))
     return winner

@@ -23,7 +23,7 @@ from search.pool import Pool, uninterrupted
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
 from search.storage import HEARTBEAT_INTERVAL, PATIENCE, Outlasting, ServerLost, load_study, open_storage
-from search.training import check_actions
+from search.training import DeviceError, check_actions
 from search.trials import loss_of, ranked
 
 logger = logging.getLogger(__name__)
@@ -111,6 +111,18 @@ def keep_config(study: optuna.Study, config: SearchConfig) -> None:
         study.set_user_attr(CONFIG_KEY, texts)
 
 
+def is_search(study: optuna.Study) -> bool:
+    """
+    Whether a study has the configuration of a search, and not something else under that name.
+
+    :param study: The study
+    """
+    name, texts = study.study_name, study.user_attrs.get(CONFIG_KEY)
+    expected = {f"{name}.yml", f"{name}-hyperparameters.yml"}
+    is_text = isinstance(texts, dict) and texts.keys() == expected and all(isinstance(text, str) for text in texts.values())
+    return is_text and len(study.directions) == 1
+
+
 def stored_config(study: optuna.Study, folder: Path) -> SearchConfig:
     """
     The configuration that :func:`keep_config` left in a study, checked like any other.
@@ -122,9 +134,7 @@ def stored_config(study: optuna.Study, folder: Path) -> SearchConfig:
     name, texts = study.study_name, study.user_attrs.get(CONFIG_KEY)
     if texts is None:
         raise ValueError(f"study {name!r} has no configuration: begin it, or go on with it, with aarl search")
-    expected = {f"{name}.yml", f"{name}-hyperparameters.yml"}
-    is_text = isinstance(texts, dict) and texts.keys() == expected and all(isinstance(text, str) for text in texts.values())
-    if not is_text or Path(name).name != name or name == "..":
+    if not is_search(study) or Path(name).name != name or name == "..":
         raise ValueError(f"study {name!r} has a configuration of another kind")
     folder = folder / "config"
     for file, text in texts.items():
@@ -209,12 +219,28 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
             if workers.was_failed(error):
                 logger.warning("A trial of this worker was failed by another one meanwhile: %s", error)
                 continue
-            if problem := disk_problem(error, folder):
-                raise DiskError(problem) from None
             for cause in causes(error):
                 if isinstance(cause, ServerLost):  # Optuna stumbles over what follows from it
                     raise cause from None
-            raise
+                if isinstance(cause, DeviceError):  # the pool starts another process, which takes the candidate up
+                    logger.error("This worker ends: %s", cause)
+                    raise SystemExit(1) from None
+            with _explained(study, name, folder):
+                raise
+
+
+@contextlib.contextmanager
+def _explained(study: optuna.Study, name: str, folder: Path) -> Iterator[None]:
+    """Say what is behind errors that a user can mend: a full disk, a study that somebody deleted."""
+    try:
+        yield
+    except Exception as error:
+        if problem := disk_problem(error, folder):
+            raise DiskError(problem) from None
+        is_key = any(isinstance(cause, KeyError) for cause in causes(error))
+        if is_key and name not in optuna.get_all_study_names(study._storage):
+            raise ValueError(f"study {name!r} was deleted from its storage") from None
+        raise
 
 
 def search(
@@ -300,12 +326,13 @@ def _drawn(progresses: Iterator[Progress], study: optuna.Study, config: SearchCo
         update_plots(study, baseline_scores(config, study._storage))
         annotate_ended(study, artifacts(folder))
 
-    for progress in progresses:
-        if _ended(progress) != ended and time.monotonic() - drawn > PLOT_SECONDS:
-            draw()
-            ended, drawn = _ended(progress), time.monotonic()
-        yield progress
-    draw()
+    with _explained(study, config.name, folder):
+        for progress in progresses:
+            if _ended(progress) != ended and time.monotonic() - drawn > PLOT_SECONDS:
+                draw()
+                ended, drawn = _ended(progress), time.monotonic()
+            yield progress
+        draw()
 
 
 def _fill(
@@ -327,7 +354,8 @@ def _fill(
 
 
 def _ended(progress: Progress) -> int:
-    return sum(stage.filled + stage.failed for stage in progress.stages)
+    """How many trials have ended, other than by a death."""
+    return sum(stage.filled + stage.failed - stage.died for stage in progress.stages)
 
 
 def look(study: optuna.Study, sampler: AuxLossSampler) -> Progress:

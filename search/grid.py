@@ -23,7 +23,7 @@ from search.objective import CandidateFailed, DiskError, Objective, disk_problem
 from search.pool import WorkerPool, uninterrupted
 from search.provenance import provenance
 from search.storage import PATIENCE, open_storage, study_id
-from search.training import check_actions
+from search.training import DeviceError, check_actions
 
 # How often a run is tried that fails, and one whose worker dies: it goes on from its checkpoint.
 MAX_TRIES = 3
@@ -173,6 +173,8 @@ def check_training(study: optuna.Study, trainings: Mapping[str, Mapping[str, Any
     study_id(study)  # now, before several workers do
     trainings, default = json.loads(json.dumps(trainings)), _Default()
     begun = study.user_attrs.get(TRAINING_KEY, {})
+    if not isinstance(begun, dict) or not all(isinstance(settings, dict) for settings in begun.values()):
+        raise ValueError(f"study {study.study_name!r} is not of this program: choose another name, or another storage")
     for name, settings in trainings.items():
         before = begun.setdefault(name, settings)
         for key in settings | before:
@@ -334,6 +336,8 @@ def _run_worker(grid: Runs, folder: Path, where: str) -> None:
         except Exception as error:
             if workers.was_failed(error):
                 continue
+            if isinstance(error, DeviceError):  # the pool starts another process, which goes on
+                raise SystemExit(1) from None
             if problem := disk_problem(error, folder):
                 raise DiskError(problem) from None
             raise

@@ -24,7 +24,7 @@ from search.config import SearchConfig
 from search.provenance import commit, cpu
 from search.space import distributions, suggest_aux_loss
 from search.storage import study_id
-from search.training import EnvironmentLost, TrainingError, train_candidate
+from search.training import DeviceError, EnvironmentLost, TrainingError, causes, memory_problem, train_candidate
 from search.workers import DIED_KEY
 
 # The words of SQLite and PostgreSQL for a disk that cannot be written.
@@ -34,8 +34,6 @@ DISK_MESSAGES = (
     "attempt to write a readonly database",
     os.strerror(errno.ENOSPC),
 )
-# How PyTorch says it, which has no exception of its own for the CPU.
-MEMORY_MESSAGES = ("can't allocate memory", "not enough memory", "out of memory", "ALLOC_FAILED")
 
 
 class CandidateFailed(RuntimeError):
@@ -56,8 +54,9 @@ class Objective:
 
     User attributes of a trial: ``loss`` (notation), ``canonical``, ``environment``, ``commit``, ``device`` (name of the GPU
     or the processor), ``threads``; ``curve`` (a list of [environment steps, mean, standard deviation] over the episodes
-    of all seeds) and ``seconds`` of training when it ends; ``reason`` when it fails, and ``died`` where the process of an
-    environment did; ``interrupted`` when Ctrl-C or a full disk stopped it.
+    of all seeds) and ``seconds`` of training when it ends; ``seeds_trained`` from the second seed on; ``reason`` when it
+    fails, and ``died`` where the process of an environment or a GPU did; ``interrupted`` when Ctrl-C or a full disk
+    stopped it.
 
     ``study.optimize(objective, catch=CandidateFailed)`` goes on after a candidate that failed.
 
@@ -149,14 +148,16 @@ class Objective:
 
         def report(evaluation: Evaluation) -> bool:
             nonlocal pruned
-            if not curves:
-                try:
+            try:
+                if curves:  # if another worker took this one for dead and failed the trial, the storage says so
+                    trial.set_user_attr("seeds_trained", len(curves))
+                else:
                     trial.report(evaluation.mean, evaluation.environment_steps)
                     # After the last evaluation nothing is left to spare.
                     pruned = evaluation.environment_steps != checkpoints[-1] and trial.should_prune()
-                except Exception:  # of the storage: not the candidate's fault
-                    _note_interruption(trial)
-                    raise
+            except Exception:  # of the storage: not the candidate's fault
+                _note_interruption(trial)
+                raise
             return not pruned
 
         scores = []
@@ -192,6 +193,7 @@ def end_noted(trial: optuna.Trial, folder: Path | None = None) -> Iterator[None]
     :param trial: The training's trial
     :param folder: Where the training writes
     :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
+    :raises DeviceError: when this process cannot train any more; another one takes the candidate up
     :raises DiskError: when the disk is full, or cannot be written
     :raises OSError: when something else is wrong with the folder
     """
@@ -205,14 +207,17 @@ def end_noted(trial: optuna.Trial, folder: Path | None = None) -> Iterator[None]
         if problem is not None:
             _note_interruption(trial)
             raise DiskError(problem) from error
-        reason = memory_problem(error) or (str(error) if isinstance(error, TrainingError) else None)
+        told = isinstance(error, DeviceError)
+        reason = (None if told else memory_problem(error)) or (str(error) if isinstance(error, TrainingError) else None)
         if reason is None:
             if isinstance(error, OSError):  # of the folder, such as one on another machine that went away
                 _note_interruption(trial)
             raise
         trial.set_user_attr("reason", reason)
-        if isinstance(error, EnvironmentLost):
+        if isinstance(error, EnvironmentLost | DeviceError):
             trial.set_user_attr(DIED_KEY, True)
+        if isinstance(error, DeviceError):
+            raise
         raise CandidateFailed(reason) from error
 
 
@@ -220,14 +225,6 @@ def _note_interruption(trial: optuna.Trial) -> None:
     # The storage may lie on the same full disk: a trial that stays as it is counts as one of a worker that died.
     with contextlib.suppress(Exception):
         trial.set_user_attr("interrupted", True)
-
-
-def causes(error: BaseException) -> Iterator[BaseException]:
-    """The error, what it was raised from or during, and so on."""
-    following: BaseException | None = error
-    while following is not None:
-        yield following
-        following = following.__cause__ or (None if following.__suppress_context__ else following.__context__)
 
 
 def disk_problem(error: BaseException, folder: Path | None = None) -> str | None:
@@ -248,28 +245,6 @@ def disk_problem(error: BaseException, folder: Path | None = None) -> str | None
         if what is not None:
             where = file or f"{folder or 'the folder of the search'}, or the storage"
             return f"{where}: {what}. Free or mend the disk; the same command goes on where this one stopped"
-    return None
-
-
-def memory_problem(error: BaseException) -> str | None:
-    """
-    One line if an error says that memory ran out, with how much was asked for where that is known. None for other errors.
-
-    :param error: The error
-    """
-    for cause in causes(error):
-        if (
-            isinstance(cause, (MemoryError, th.cuda.OutOfMemoryError))
-            or (isinstance(cause, OSError) and cause.errno == errno.ENOMEM)
-            or (isinstance(cause, RuntimeError) and any(message in str(cause) for message in MEMORY_MESSAGES))
-        ):
-            text = " ".join(str(cause).split())[:300]
-            size = re.search(r"allocate ([0-9]+\.?[0-9]*) (bytes|[KMGTPE]iB)", text, re.IGNORECASE)
-            asked = ""
-            if size is not None:
-                unit = ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB").index(size[2])
-                asked = f" ({float(size[1]) * 1024.0 ** (unit - 3):,.2f} GiB were asked for)"
-            return f"out of memory{asked}: {text if isinstance(cause, TrainingError) else f'{type(cause).__name__}: {text}'}"
     return None
 
 

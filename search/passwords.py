@@ -11,7 +11,8 @@ def without_password(text: str) -> str:
     """
     # A user's name may have an @, or a domain before a slash.
     text = re.sub(r"(\b[a-zA-Z][\w+.-]*:/*[^:\s]*):\S*@", r"\1:***@", text)
-    return re.sub(r"(?i)((?:password|passwd|pwd)\s*=\s*)('(?:[^'\\]|\\.)*'|[^&\s]*)", r"\1***", text)
+    text = re.sub(r"(?i)(odbc_connect=)[^&\s]*", r"\1***", text)
+    return re.sub(r"(?i)((?:password|passwd|pwd)\s*=\s*)('(?:[^'\\]|\\.)*'(?=[&\s;]|$)|[^&\s]*)", r"\1***", text)
 
 
 def storage_name(where: str) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
+import joblib  # type: ignore[import-untyped]
 import torch as th
 from optuna.exceptions import StorageInternalError
 
@@ -21,6 +22,10 @@ from search.storage import root_cause
 
 # Deaths of workers in one place, without a trial finished in between, after which the pool gives up.
 MAX_DEATHS = 5
+# Seconds after which the death of a worker is the first of its place again: clusters take machines away now and then.
+LONG_LIFE = 600.0
+# Characters of an error that reach the user: longer ones would fill the pipe, and the worker would wait for ever.
+MESSAGE_LENGTH = 8000
 # Seconds after which a worker that still runs is interrupted again: an exception that falls into a destructor is lost.
 INTERRUPT_SECONDS = 8.0
 
@@ -40,11 +45,27 @@ class Pool(Protocol):
         """
         Start workers again that died.
 
-        :param progressed: Whether a trial has finished since the last call
+        :param progressed: Whether a trial has ended since the last call, other than by a death
         :return: Whether any worker still runs
         :raises WorkerError: when a worker stopped with an error, or they keep dying
         """
         ...
+
+
+def count_death(deaths: int, seconds: float, cause: str) -> int:
+    """
+    Count the death of a worker. Each place has its own count: what kills all at once says nothing about them.
+
+    :param deaths: How many there were in its place before, without a trial ended in between
+    :param seconds: For how long it lived
+    :param cause: What is known of it
+    :return: How many there are now
+    :raises WorkerError: when they are too many
+    """
+    deaths = deaths + 1 if seconds < LONG_LIFE else 1
+    if deaths > MAX_DEATHS:
+        raise WorkerError(f"{deaths} workers died one after the other ({cause})")
+    return deaths
 
 
 def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, threads: int, parent: int) -> None:
@@ -60,7 +81,7 @@ def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, 
     except KeyboardInterrupt:
         os._exit(128 + _interrupted.get("signal", signal.SIGINT))
     except Exception as error:
-        errors.put(message(error))
+        errors.put(message(error)[:MESSAGE_LENGTH])
         os._exit(1)
 
 
@@ -144,10 +165,11 @@ class WorkerPool:
         # Not fork: PyTorch's threads and open storages do not survive it.
         self._context = multiprocessing.get_context("spawn")
         self._errors = self._context.SimpleQueue()
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._start = (target, arguments, self._errors, threads or max(1, cores // n_workers))
+        # Those that a container may use, too, where it has fewer than the machine.
+        self._start = (target, arguments, self._errors, threads or max(1, joblib.cpu_count() // n_workers))
         self.processes: list[BaseProcess] = []
         self._deaths: dict[BaseProcess, int] = {}  # of those before it in its place
+        self._started: dict[BaseProcess, float] = {}
         self._gpus = visible_gpus()
         self._gpu_of: dict[BaseProcess, str] = {}
         self._n_workers = n_workers
@@ -168,13 +190,14 @@ class WorkerPool:
             process.start()
         self.processes.append(process)
         self._deaths[process] = deaths
+        self._started[process] = time.monotonic()
         self._gpu_of[process] = variables.get("CUDA_VISIBLE_DEVICES", "")
 
     def check(self, progressed: bool) -> bool:
         """
         Start workers again that were killed.
 
-        :param progressed: Whether a trial has finished since the last call
+        :param progressed: Whether a trial has ended since the last call, other than by a death
         :return: Whether any worker still runs
         :raises WorkerError: when a worker stopped with an error, or they keep dying
         """
@@ -185,16 +208,14 @@ class WorkerPool:
                 continue
             self.processes.remove(process)
             self._gpu_of.pop(process)
-            # Counted for each place: what kills all at once says nothing about them.
-            deaths = self._deaths.pop(process) + 1
+            deaths, lived = self._deaths.pop(process), time.monotonic() - self._started.pop(process)
             if not self._errors.empty():
                 raise WorkerError(self._errors.get())
             if process.exitcode == 128 + signal.SIGINT:
                 raise KeyboardInterrupt
             if process.exitcode != 0:
-                if deaths > MAX_DEATHS:
-                    raise WorkerError(f"{deaths} workers died one after the other (exit code {process.exitcode})")
-                self._add(deaths)
+                killed = ": killed, as systems do whose memory runs out" if process.exitcode == -signal.SIGKILL else ""
+                self._add(count_death(deaths, lived, f"exit code {process.exitcode}{killed}"))
         return bool(self.processes)
 
     def __exit__(self, *exception: Any) -> None:

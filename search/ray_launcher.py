@@ -8,13 +8,16 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
-from urllib.parse import urlsplit
+
+import joblib  # type: ignore[import-untyped]
 
 from search.passwords import storage_name, without_password
-from search.pool import INTERRUPT_SECONDS, MAX_DEATHS, WorkerError, _interrupt_again, _interrupt_once, message
+from search.pool import INTERRUPT_SECONDS, WorkerError, _interrupt_again, _interrupt_once, count_death, message
+from search.storage import is_local
 
 try:
     import ray
@@ -69,12 +72,14 @@ class RayWorker:
     """
     :param task: What it runs
     :param deaths: How many before it died in its place, without a trial finished in between
+    :param started: When it got to work, or in line for it, by the monotonic clock
     :param node: Id of the node that it runs on, None while Ray has no room for it
     :param pid: Its process number there
     """
 
     task: "ray.ObjectRefGenerator"
     deaths: int = 0
+    started: float = field(default_factory=time.monotonic)
     node: str | None = None
     pid: int | None = None
 
@@ -158,7 +163,7 @@ class RayPool:
         """
         Start workers again that died, and some on nodes that have joined.
 
-        :param progressed: Whether a trial has finished since the last call
+        :param progressed: Whether a trial has ended since the last call, other than by a death
         :return: Whether any worker still runs
         :raises WorkerError: when a worker stopped with an error, or they keep dying
         :raises ValueError: when a node has joined that cannot reach the storage
@@ -196,14 +201,12 @@ class RayPool:
                     raise WorkerError(said)
                 return True
             worker.node, worker.pid = said
+            worker.started = time.monotonic()
         return False
 
     def _replace(self, worker: RayWorker, error: RayError) -> None:
-        # Counted for each place: a node takes all of its workers along, which says nothing about them.
-        deaths = worker.deaths + 1
-        if deaths > MAX_DEATHS:
-            reason = str(error).partition("\n")[0]
-            raise WorkerError(f"{deaths} workers died one after the other ({type(error).__name__}: {reason})")
+        cause = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        deaths = count_death(worker.deaths, time.monotonic() - worker.started, cause)
         if not self._finished:
             self._add(deaths)
 
@@ -267,7 +270,7 @@ def _joined(address: str | None) -> Iterator[None]:
     handler = signal.getsignal(signal.SIGTERM)
     try:
         if address is None:
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+            cores = joblib.cpu_count()
             local: dict[str, Any] = {"num_cpus": cores, "include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
             try:
                 _init(address="local", **local, **quiet)
@@ -319,8 +322,7 @@ def check_storage(where: str) -> None:
     :param where: The storage, as for :func:`search.storage.open_storage`
     :raises ValueError: naming the machines that cannot reach it
     """
-    host = urlsplit(where).hostname or "" if "://" in where else ""
-    if "://" in where and not where.startswith("sqlite") and host not in ("localhost", "::1") and not host.startswith("127."):
+    if not is_local(where):
         return
     nodes = [node for node in ray.nodes() if node["Alive"]]
     here = ray.get_runtime_context().get_node_id()

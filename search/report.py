@@ -23,6 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.callbacks import replace_text
 from search import analysis, cross_validation, grid
 from search import table as tables
 from search.benchmark import read_curves, task_name
@@ -190,9 +191,7 @@ def write_report(
         settings=dict(settings),
         provenance=dict(provenance or {}),
     )
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(html, encoding="utf-8")
+    replace_text(Path(path), html)
 
 
 def _validation(runs: pd.DataFrame | None) -> tuple[pd.DataFrame, int] | None:

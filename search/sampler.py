@@ -78,6 +78,7 @@ class StageProgress(NamedTuple):
     :param filled: Places whose trial is complete or pruned
     :param running: Places whose trial runs
     :param failed: Failed trials so far
+    :param died: Those of them whose worker died, or the process of an environment
     """
 
     stage: int
@@ -85,6 +86,7 @@ class StageProgress(NamedTuple):
     filled: int
     running: int
     failed: int
+    died: int = 0
 
 
 class _Register:
@@ -326,8 +328,9 @@ class AuxLossSampler(BaseGASampler):
                 states = [holder.state for place in range(places) for holder in register.held_by(stage, place)[:1]]
                 filled = sum(state in FILLED for state in states)
                 tried = [number for place in range(places) for number in register.holders.get((stage, place), ())]
-                failed = sum(register.trials[number].state == TrialState.FAIL for number in tried)
-                progress.append(StageProgress(stage, places, filled, len(states) - filled, failed))
+                failed = [trial for number in tried if (trial := register.trials[number]).state == TrialState.FAIL]
+                died = sum(bool(trial.user_attrs.get(workers.DIED_KEY)) for trial in failed)
+                progress.append(StageProgress(stage, places, filled, len(states) - filled, len(failed), died))
             return progress
 
     def has_place(self, study: Study) -> bool:

@@ -196,15 +196,23 @@ def _outlasting(method: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(method)
     def call(storage: "Outlasting", *arguments: Any, **keywords: Any) -> Any:
         def patience() -> float:
+            if storage.gave_up:  # who puts away what it has shall not wait as long once more
+                return 0.0
             # What a late sign of life says is no longer true, and the end of a trial waits for the thread that gives them.
             return min(storage.patience, storage.heartbeat_interval) if method.__name__ == "_beat" else storage.patience
 
         try:
-            return outlast(lambda: method(storage, *arguments, **keywords), storage.is_lost, patience, storage.server)
+            result = outlast(lambda: method(storage, *arguments, **keywords), storage.is_lost, patience, storage.server)
         except ServerLost:
-            if method.__name__ != "_beat":
-                storage.patience = 0.0  # who puts away what it has shall not wait as long once more
+            storage.gave_up = storage.gave_up or method.__name__ != "_beat"
             raise
+        except Exception as error:
+            refused = storage.refusal(error)
+            if refused is None:
+                raise
+            raise refused from None
+        storage.gave_up = False  # a proxy lives on, and the next outage is another one
+        return result
 
     return call
 
@@ -302,6 +310,7 @@ class Outlasting(WithHeartbeat):
     """
 
     patience: float = PATIENCE
+    gave_up: bool = False  # whether a call has waited in vain, and none has been answered since
     server: str
 
     def __init_subclass__(cls) -> None:
@@ -314,6 +323,10 @@ class Outlasting(WithHeartbeat):
     @abstractmethod
     def is_lost(self, error: Exception) -> bool:
         """Whether an exception says that the server is away, and not that it refuses what it is asked for."""
+
+    def refusal(self, error: Exception) -> StorageInternalError | None:
+        """What to raise in the place of a server's own exception, None for that itself."""
+        return None
 
     def set_trial_state_values(self, trial_id: int, state: TrialState, values: Sequence[float] | None = None) -> bool:
         """As in Optuna."""
@@ -464,6 +477,14 @@ class Proxy(Outlasting, GrpcStorageProxy):
         lost = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED, grpc.StatusCode.DEADLINE_EXCEEDED)
         return isinstance(error, grpc.RpcError) and error.code() in lost
 
+    def refusal(self, error: Exception) -> StorageInternalError | None:
+        """What stands behind the proxy, such as a full disk, in its own words."""
+        import grpc
+
+        if not isinstance(error, grpc.RpcError) or self.is_lost(error):
+            return None
+        return StorageInternalError(f"{self.server}: {root_cause(error)}")
+
 
 class Journal(WithHeartbeat, JournalStorage):
     """
@@ -555,6 +576,23 @@ def _parse_url(where: str) -> URL:
     return url.set(drivername="postgresql+psycopg") if scheme in ("postgresql", "postgres") else url
 
 
+def is_local(where: str) -> bool:
+    """
+    Whether a storage can be reached from this machine only.
+
+    :param where: As for :func:`open_storage`
+    """
+    if "://" not in where or where.startswith("sqlite"):
+        return True
+    host: object = urlsplit(where).hostname
+    if not where.startswith("grpc:"):
+        url = make_url(where)
+        # As PostgreSQL looks for it; without any, and with a path, it is a socket.
+        host = url.host or url.query.get("host") or os.environ.get("PGHOST")
+    hosts = str(host or "").split(",")
+    return all(host in ("", "localhost", "::1") or host.startswith(("127.", "/", "@")) for host in hosts)
+
+
 def _connect_args(url: URL) -> dict[str, Any]:
     """How to connect, as far as the URL does not say."""
     if url.get_backend_name() == "sqlite":
@@ -569,6 +607,8 @@ def _connect_args(url: URL) -> dict[str, Any]:
 def _open_database(url: URL, create: bool, heartbeat_interval: int) -> Database:
     is_sqlite = url.get_backend_name() == "sqlite"
     path = Path(url.database or ":memory:")
+    if is_sqlite and (path.name == ":memory:" or str(path).startswith("file:")):
+        raise ValueError("a file that all workers open is expected, such as sqlite:///study.db")
     if is_sqlite and not create and not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
     for attempt in range(3):
@@ -664,7 +704,25 @@ def serve_proxy(where: str, host: str = "127.0.0.1", port: int = 13000) -> None:
         ("grpc.so_reuseport", 0),  # else two proxies share one port
         ("grpc.max_receive_message_length", -1),
     ]
-    server = grpc.server(ThreadPoolExecutor(PROXY_THREADS), options=options)
+
+    class Answers(grpc.ServerInterceptor):  # type: ignore[misc]
+        """Tells workers what is wrong with the database, so that they wait for it, or name it; gRPC says "unknown"."""
+
+        def intercept_service(self, continuation: Any, details: Any) -> Any:
+            handler = continuation(details)
+            if handler is None:  # a call that Optuna's proxy does not have
+                return None
+
+            def answer(request: Any, context: Any) -> Any:
+                try:
+                    return handler.unary_unary(request, context)
+                except StorageInternalError as error:
+                    lost = isinstance(error, ServerLost)
+                    context.abort(grpc.StatusCode.UNAVAILABLE if lost else grpc.StatusCode.INTERNAL, root_cause(error))
+
+            return grpc.unary_unary_rpc_method_handler(answer, handler.request_deserializer, handler.response_serializer)
+
+    server = grpc.server(ThreadPoolExecutor(PROXY_THREADS), interceptors=[Answers()], options=options)
     add_StorageServiceServicer_to_server(OptunaStorageProxyService(storage), server)
     try:
         server.add_insecure_port(f"{host}:{port}")

@@ -1,6 +1,7 @@
 """Train one candidate: environment, model, learning curve, and checkpoints from which a killed training goes on."""
 
 import contextlib
+import errno
 import functools
 import hashlib
 import io
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
@@ -39,6 +41,8 @@ EVALUATION_SEEDS = 1_000_000
 HALF = 2**31
 MODEL = "model.zip"
 UNFINISHED = "unfinished-"  # name of a checkpoint that is being written
+# How PyTorch says it, which has no exception of its own for the CPU.
+MEMORY_MESSAGES = ("can't allocate memory", "not enough memory", "out of memory", "ALLOC_FAILED")
 
 
 class TrainingError(RuntimeError):
@@ -47,6 +51,14 @@ class TrainingError(RuntimeError):
 
 class EnvironmentLost(TrainingError):
     """The process of an environment died; the checkpoint stays, as after the death of a worker."""
+
+
+class DeviceError(TrainingError):
+    """
+    This process cannot train any more, whatever the candidate: its GPU failed, or has no memory left for a checkpoint.
+
+    The checkpoint stays, as after the death of a worker. After an error of CUDA all further calls of a process fail.
+    """
 
 
 class _Unrelated(BaseException):
@@ -160,6 +172,7 @@ def train_candidate(
     :param progress_bar: Whether to show a progress bar
     :raises TrainingError: when the training fails while it runs, the cause being its ``__cause__``
     :raises EnvironmentLost: when the process of an environment was killed (``vec_env="subproc"``); the last checkpoint stays
+    :raises DeviceError: when the GPU failed, or there is no memory to go on with a checkpoint; the last checkpoint stays
     :raises OSError: when the disk is full or broken, or there is a checkpoint but no key to read it with; the last checkpoint
         stays, and the same call goes on from it
     :raises FileExistsError: when the folder has the model of another training
@@ -222,8 +235,10 @@ def train_candidate(
             except Exception as error:  # an interruption is none
                 if _was_killed(error, env, eval_env):
                     raise EnvironmentLost("the process of an environment was killed") from error
-                # One of the disk: the checkpoint waits for a better one.
-                if store is not None and not isinstance(error, OSError):
+                if problem := device_problem(error):
+                    raise DeviceError(problem) from error
+                # The checkpoint waits for a better disk, or a process that has room for it.
+                if store is not None and not isinstance(error, OSError | DeviceError):
                     store.remove_checkpoint()
                 raise
     else:
@@ -329,14 +344,56 @@ def _repeat(curve: Sequence[Evaluation], on_evaluation: Callable[[Evaluation], b
 
 
 def _learn(model: SACAux, agent_steps: int, callbacks: list[BaseCallback], progress_bar: bool) -> None:
-    """Train up to a number of agent steps; whatever goes wrong, but for the disk, is the candidate's failure."""
+    """Train up to a number of agent steps; whatever goes wrong, but for disk and GPU, is the candidate's failure."""
     try:
         remaining = agent_steps - model.num_timesteps
         model.learn(remaining, callbacks, log_interval=10**9, reset_num_timesteps=False, progress_bar=progress_bar)
     except Exception as error:
-        if is_disk_error(error):
+        if is_disk_error(error) or device_problem(error):
             raise
         raise TrainingError(" ".join(f"{type(error).__name__}: {error}".split())) from error
+
+
+def causes(error: BaseException) -> Iterator[BaseException]:
+    """The error, what it was raised from or during, and so on."""
+    following: BaseException | None = error
+    while following is not None:
+        yield following
+        following = following.__cause__ or (None if following.__suppress_context__ else following.__context__)
+
+
+def memory_problem(error: BaseException) -> str | None:
+    """
+    One line if an error says that memory ran out, with how much was asked for where that is known. None for other errors.
+
+    :param error: The error
+    """
+    for cause in causes(error):
+        if (
+            isinstance(cause, (MemoryError, th.cuda.OutOfMemoryError))
+            or (isinstance(cause, OSError) and cause.errno == errno.ENOMEM)
+            or (isinstance(cause, RuntimeError) and any(message in str(cause) for message in MEMORY_MESSAGES))
+        ):
+            text = " ".join(str(cause).split())[:300]
+            size = re.search(r"allocate ([0-9]+\.?[0-9]*) (bytes|[KMGTPE]iB)", text, re.IGNORECASE)
+            asked = ""
+            if size is not None:
+                unit = ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB").index(size[2])
+                asked = f" ({float(size[1]) * 1024.0 ** (unit - 3):,.2f} GiB were asked for)"
+            return f"out of memory{asked}: {text if isinstance(cause, TrainingError) else f'{type(cause).__name__}: {text}'}"
+    return None
+
+
+def device_problem(error: BaseException) -> str | None:
+    """
+    One line if an error says that a GPU failed, which is not the candidate's fault. None for other errors.
+
+    :param error: The error
+    """
+    for cause in causes(error):
+        if isinstance(cause, RuntimeError) and "CUDA error" in str(cause) and memory_problem(cause) is None:
+            return "the GPU failed: " + " ".join(str(cause).split())[:300]
+    return None
 
 
 class _RunFolder:
@@ -387,6 +444,8 @@ class _RunFolder:
             except (OSError, EOFError):
                 raise  # of the disk, or the process of an environment: they say nothing of the checkpoint
             except Exception as error:  # what other versions do to pickle and torch
+                if problem := memory_problem(error) or device_problem(error):
+                    raise DeviceError(f"the checkpoint {newest} could not be taken up: {problem}") from error
                 logger.warning("The checkpoint %s is of no use, training begins anew: %s", newest, error)
             else:
                 logger.info("Training goes on after %d environment steps", curve[-1].environment_steps)
@@ -427,14 +486,21 @@ class _RunFolder:
             write_curve(unfinished / "curve.csv", curve)
             self._describe(unfinished)
             seal(unfinished, key, {"cut_off": cut_off})
-            checkpoint = self._checkpoints / str(curve[-1].environment_steps)
+            steps = curve[-1].environment_steps
+            checkpoint = self._checkpoints / str(steps)
             if not checkpoint.exists():  # else it is that of the same training at the same step
                 unfinished.rename(checkpoint)
+            sync_folder(self._checkpoints)
+        except FileNotFoundError:
+            if unfinished.exists():
+                raise
+            logger.warning("No checkpoint is kept in %s now: another worker took it away", self.folder)
+            return
         finally:
             _remove(unfinished)  # half of it may be what fills the disk
-        sync_folder(self._checkpoints)
         for path in self._checkpoints.glob("*"):
-            if path != checkpoint and path.name.isdecimal():
+            # Another worker, which took this one for dead, may be further.
+            if path.name.isdecimal() and int(path.name) < steps:
                 _remove(path)
 
     def save_model(self, model: SACAux) -> None:

@@ -3,11 +3,12 @@
 import contextlib
 import os
 import platform
+import time
 from collections.abc import Iterable
-from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import psutil
 from optuna.exceptions import UpdateFinishedTrialError
@@ -101,6 +102,15 @@ def was_failed(error: Exception) -> bool:
     )
 
 
+_first_seen: WeakKeyDictionary[BaseStorage, dict[int, float]] = WeakKeyDictionary()
+
+
+def _known_for(storage: BaseStorage, trial: FrozenTrial) -> float:
+    """For how many seconds this process has known a trial; when it began is a matter of another machine's clock."""
+    now = time.monotonic()
+    return now - _first_seen.setdefault(storage, {}).setdefault(trial._trial_id, now)
+
+
 def beat(storage: BaseStorage, trial_id: int) -> None:
     """
     Give a sign of life for a running trial, where the storage keeps them.
@@ -136,13 +146,11 @@ def fail_dead(
         if trial.state != TrialState.RUNNING:
             continue
         worker = trial.user_attrs.get(WORKER_KEY)
-        age = datetime.now() - (trial.datetime_start or datetime.now())
         if worker is None:
-            died = all_have_names and age > timedelta(seconds=UNNAMED_SECONDS)
+            died = all_have_names and _known_for(study._storage, trial) > UNNAMED_SECONDS
         else:
             # A heartbeat's copy of a dead trial begins with the name of the dead worker.
-            is_copy = "failed_trial" in trial.system_attrs and age < timedelta(seconds=10)
-            died = not is_copy and is_dead(worker)
+            died = is_dead(worker) and ("failed_trial" not in trial.system_attrs or _known_for(study._storage, trial) > 10)
         failed += died and fail(study, trial, "its worker died")
     storage: Any = study._storage
     if is_heartbeat_enabled(storage):

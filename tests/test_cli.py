@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
 from search import training
-from search.cli import ZOO, app
+from search.cli import ZOO, app, main
 from search.config import load_config
 from search.cross_validation import make_grid
 from search.grid import MAX_TRIES, Cell, Grid
@@ -203,6 +203,38 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(run: str, monkey
     result = runner.invoke(app, ["dashboard", run, "--port", "8123"])
     assert result.exit_code == 0, result.stderr
     assert served == [(["some"], Path("runs/some/artifacts"), "127.0.0.1", 8123)]
+
+
+def test_dashboard_leaves_studies_alone_that_are_no_searches(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    storage = open_storage("runs/some")
+    for name, directions in (("one", ["minimize"]), ("two", ["minimize", "maximize"])):
+        study = optuna.create_study(study_name=name, storage=storage, directions=directions)
+        study.set_user_attr("config", {"learning_rate": 1e-3})
+        study.add_trial(optuna.create_trial(values=[1.0] * len(directions)))
+    before = [(study.user_attrs, study.system_attrs) for study in storage.get_all_studies()]
+    monkeypatch.setattr("search.dashboard.serve", lambda *arguments: None)
+    result = runner.invoke(app, ["dashboard", "runs/some"])
+    assert result.exit_code == 0, result.stderr
+    assert [(study.user_attrs, study.system_attrs) for study in storage.get_all_studies()] == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["search", "postgresql://me:s3cret@db/x"],
+        ["search", "a.yml", "postgresql://me:s3cret@db/x"],
+        ["worker", "grpc://a:s3cret@b"],
+    ],
+)
+def test_a_storage_in_the_wrong_place_is_refused_without_its_password(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["aarl", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr()
+    assert ended.value.code == 2
+    assert "--storage" in said.err and "s3cret" not in said.out + said.err and len(said.err.splitlines()) == 1
 
 
 SEARCH = """

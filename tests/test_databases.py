@@ -28,6 +28,7 @@ from postgres import PASSWORD, Postgres, free_port
 from sqlalchemy.exc import DBAPIError, OperationalError
 
 from search import workers
+from search.objective import disk_problem
 from search.storage import Database, ServerLost, SharedReads, open_storage, serve_proxy
 
 pytestmark = pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed")
@@ -180,7 +181,7 @@ def test_time_is_up_once_however_calls_are_nested(postgres: Postgres, url: str) 
     postgres.stop()
     try:
         for call in (lambda: study.best_trial, lambda: storage.get_best_trial(study._study_id)):
-            storage.patience = 1.0
+            storage.patience, storage.gave_up = 1.0, False
             started = time.monotonic()
             with pytest.raises(ServerLost, match="tried for 1 s"):
                 call()
@@ -191,12 +192,24 @@ def test_time_is_up_once_however_calls_are_nested(postgres: Postgres, url: str) 
                 storage.set_trial_user_attr(trial._trial_id, "reason", "lost")
             assert time.monotonic() - started < 0.9
         # The thread that gives signs of life must live, and the end of a trial waits for it.
-        storage.patience, storage.heartbeat_interval = 600, 1
+        storage.patience, storage.gave_up, storage.heartbeat_interval = 600, False, 1
         started = time.monotonic()
         storage.record_heartbeat(trial._trial_id)
         assert time.monotonic() - started < 4
+        storage.patience = 0.5
+        with pytest.raises(ServerLost, match="tried for"):
+            storage.get_all_studies()
     finally:
         postgres.start()
+    # The next outage, of a proxy that lives on, is waited for again.
+    storage.patience = 30
+    assert len(storage.get_all_studies()) == 1
+    postgres.stop()
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit(storage.get_all_studies)
+        time.sleep(1)
+        postgres.start()
+        assert len(read.result()) == 1
 
 
 def test_errors_that_are_no_outage_are_not_waited_for(url: str) -> None:
@@ -539,6 +552,54 @@ def test_a_proxy_stops_on_ctrl_c_also_while_its_database_is_away(postgres: Postg
             waiting.join(10)
         finally:
             postgres.start()
+
+
+IMPATIENT = """
+import sys
+from search import storage
+storage.Database.patience = 0.5
+storage.serve_proxy(sys.argv[1], port=int(sys.argv[2]))
+"""
+
+
+def test_workers_wait_for_the_database_behind_a_proxy_that_gave_up(postgres: Postgres, url: str) -> None:
+    port = free_port()
+    with python(IMPATIENT, url, str(port)):
+        storage: BaseStorage = open_storage(f"grpc://127.0.0.1:{port}", patience=30)
+        study = optuna.create_study(study_name="study", storage=storage)
+        for _ in range(2):
+            postgres.stop()
+            with ThreadPoolExecutor(1) as pool:
+                asked = pool.submit(study.ask)
+                time.sleep(2)
+                assert not asked.done()
+                postgres.start()
+                study.tell(asked.result(), 1.0)
+
+
+def test_what_the_database_behind_a_proxy_refuses_reaches_the_worker(url: str) -> None:
+    port = free_port()
+    with proxy(url, port):
+        storage: BaseStorage = open_storage(f"grpc://127.0.0.1:{port}", patience=30)
+        study = optuna.create_study(study_name="study", storage=storage)
+        trial = study.ask()
+        with psycopg.connect(url, autocommit=True) as connection:
+            # PostgreSQL's own words for a full disk.
+            connection.execute(
+                "CREATE FUNCTION full_disk() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN RAISE EXCEPTION "
+                "'could not extend file: No space left on device' USING ERRCODE = 'disk_full'; END $$"
+            )
+            connection.execute(
+                "CREATE TRIGGER full_disk BEFORE INSERT ON trial_user_attributes FOR EACH ROW EXECUTE FUNCTION full_disk()"
+            )
+            with pytest.raises(StorageInternalError, match="No space left on device") as error:
+                trial.set_user_attr("key", 1)
+            problem = disk_problem(error.value)
+            assert problem is not None and "Free or mend the disk" in problem and "\n" not in problem
+            assert PASSWORD not in problem
+            connection.execute("DROP TRIGGER full_disk ON trial_user_attributes")
+        trial.set_user_attr("key", 1)
+        study.tell(trial, 1.0)
 
 
 class CountedLock:

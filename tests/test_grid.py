@@ -299,6 +299,15 @@ def with_checkpoints(*checkpoints: int) -> SearchConfig:
     return replace(CONFIG, cross_validation=CrossValidation((CONFIG.environment, OTHER), checkpoints={OTHER: checkpoints}))
 
 
+@pytest.mark.parametrize("value", ["yesterday", {"candidates": "all of them"}])
+def test_a_study_of_another_program_is_no_grid(value: Any, tmp_path: Path) -> None:
+    study = optuna.create_study(study_name=GRID.name, storage=open_storage(tmp_path), direction="maximize")
+    study.set_user_attr(grid.TRAINING_KEY, value)
+    with pytest.raises(ValueError, match="'some-grid' is not of this program"):
+        next(grid.run(GRID, tmp_path, str(tmp_path)))
+    assert study.user_attrs[grid.TRAINING_KEY] == value
+
+
 @pytest.mark.parametrize(
     ("changed", "name"),
     [

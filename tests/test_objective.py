@@ -27,11 +27,12 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_aarl import AuxLoss, SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve
 from sb3_aarl.envs import make_dmc_env
-from search import training
+from search import evolve, training, workers
 from search.config import load_config
 from search.objective import CandidateFailed, Objective, make_pruner, mean_curve
 from search.sampler import AuxLossSampler
 from search.space import loss_to_params
+from search.storage import open_storage
 from search.training import TrainingError, spread_checkpoints, train_candidate
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
@@ -324,6 +325,74 @@ def test_a_candidate_whose_environment_died_is_given_out_again(tmp_path: Path, m
     assert [trial.state for trial in study.trials] == [TrialState.FAIL, TrialState.FAIL, TrialState.COMPLETE]
     assert len({trial.user_attrs["loss"] for trial in study.trials}) == 1
     assert study.trials[0].user_attrs["reason"] == "the process of an environment was killed"
+
+
+def test_a_worker_whose_gpu_failed_ends_and_another_one_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All further calls of its process would fail, and innocent candidates with them."""
+    objective = make_objective(tmp_path, n_random=2, n_prior=0, stages=1)
+    config, where = objective.config, f"sqlite:///{tmp_path / 'study.db'}"
+    sampler = AuxLossSampler(**config.sampler_settings())
+    study = optuna.create_study(study_name="search", storage=open_storage(where), sampler=sampler, direction="maximize")
+    evolve.keep_config(study, config)
+
+    def fail(*arguments: Any, **keywords: Any) -> training.TrainingRun:
+        raise training.DeviceError("the GPU failed: CUDA error: unspecified launch failure")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("search.objective.train_candidate", fail)
+        with pytest.raises(SystemExit) as ended:
+            evolve.run_worker("search", tmp_path, where, 60)
+    assert ended.value.code == 1
+    (failed,) = study.trials
+    assert failed.state == TrialState.FAIL and failed.user_attrs["reason"].startswith("the GPU failed: CUDA error")
+    run = training.TrainingRun([Evaluation(800, 1.0, 0.0, 1, 0.0)], 1.0)
+    monkeypatch.setattr("search.objective.train_candidate", lambda *arguments, **keywords: run)
+    evolve.run_worker("search", tmp_path, where, 60)
+    assert [trial.state for trial in study.trials] == [TrialState.FAIL, TrialState.COMPLETE, TrialState.COMPLETE]
+    assert study.trials[1].user_attrs["loss"] == failed.user_attrs["loss"]
+
+
+@pytest.mark.parametrize("kind", ["journal", "sqlite"])
+def test_a_study_that_somebody_deletes_is_named(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    objective = make_objective(tmp_path, n_random=2, n_prior=0, stages=1)
+    where = str(tmp_path) if kind == "journal" else f"sqlite:///{tmp_path / 'study.db'}"
+    sampler = AuxLossSampler(**objective.config.sampler_settings())
+    study = optuna.create_study(study_name="search", storage=open_storage(where), sampler=sampler, direction="maximize")
+    evolve.keep_config(study, objective.config)
+
+    def delete(*arguments: Any, on_evaluation: Callable[[Evaluation], bool], **keywords: Any) -> training.TrainingRun:
+        optuna.delete_study(study_name="search", storage=open_storage(where))
+        evaluation = Evaluation(800, 1.0, 0.0, 1, 0.0)
+        on_evaluation(evaluation)
+        return training.TrainingRun([evaluation], 1.0)
+
+    monkeypatch.setattr("search.objective.train_candidate", delete)
+    message = r"^study 'search' was deleted from its storage$"
+    with pytest.raises(ValueError, match=message):
+        evolve.run_worker("search", tmp_path, where, 60)
+    with pytest.raises(ValueError, match=message), evolve._explained(study, "search", tmp_path):
+        evolve.look(study, sampler)
+
+
+def test_a_worker_that_was_taken_for_dead_trains_no_further_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    objective = make_objective(tmp_path, seeds=[0, 1, 2])
+    study = optuna.create_study(direction="maximize", sampler=RandomSampler(0))
+    trained = []
+
+    def train(*arguments: Any, on_evaluation: Callable[[Evaluation], bool], **keywords: Any) -> training.TrainingRun:
+        trained.append(arguments[3])
+        if len(trained) == 2:
+            assert workers.fail(study, study.trials[0], "its worker died")
+        evaluation = Evaluation(800, 1.0, 0.0, 1, 0.0)
+        on_evaluation(evaluation)
+        return training.TrainingRun([evaluation], 1.0)
+
+    monkeypatch.setattr("search.objective.train_candidate", train)
+    study.enqueue_trial(loss_to_params(LOSS))
+    with pytest.raises(Exception) as raised:
+        study.optimize(objective, n_trials=1)
+    assert workers.was_failed(raised.value)
+    assert trained == [0, 1]
 
 
 def test_several_environments_go_on_after_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -212,6 +212,37 @@ def test_workers_that_are_killed_all_at_once_are_all_replaced(tmp_path: Path, mo
         (tmp_path / "done").touch()
 
 
+def test_a_worker_that_lived_long_is_the_first_that_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cluster takes a machine away every few hours, while one candidate trains on it."""
+    monkeypatch.setattr(pool_module, "MAX_DEATHS", 1)
+    monkeypatch.setattr(pool_module, "LONG_LIFE", 0.0)
+    with WorkerPool(wait_for_the_end, (tmp_path,), n_workers=1, threads=1) as pool:
+        for _ in range(3):
+            (process,) = pool.processes
+            process.kill()
+            process.join()
+            assert pool.check(progressed=False)
+        monkeypatch.setattr(pool_module, "LONG_LIFE", 600.0)
+        pool.processes[0].kill()
+        pool.processes[0].join()
+        with pytest.raises(WorkerError, match=r"2 workers died one after the other \(exit code -9: killed, as .*memory"):
+            pool.check(progressed=False)
+        (tmp_path / "done").touch()
+
+
+def raise_much() -> None:
+    raise ValueError("x" * 1_000_000)
+
+
+def test_a_long_message_does_not_keep_a_worker(tmp_path: Path) -> None:
+    with pytest.raises(WorkerError, match=r"^x{1000,}$") as error, WorkerPool(raise_much, (), 1, 1) as pool:
+        deadline = time.monotonic() + 60
+        while pool.check(progressed=False):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    assert len(str(error.value)) == pool_module.MESSAGE_LENGTH
+
+
 def test_a_finished_trial_forgets_deaths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pool_module, "MAX_DEATHS", 1)
     with WorkerPool(wait_for_the_end, (tmp_path,), n_workers=1, threads=1) as pool:

@@ -15,6 +15,7 @@ import pytest
 import torch as th
 from optuna.trial import TrialState
 
+from search import pool as pool_module
 from search import ray_launcher, workers
 from search.pool import WorkerError
 from search.ray_launcher import RayPool, RayWorker, check_storage
@@ -161,6 +162,21 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def leave(folder: Path) -> None:
+    (folder / str(os.getpid())).touch()
+    raise SystemExit(1)  # as a worker whose GPU failed
+
+
+def test_a_worker_that_leaves_is_replaced_and_counted(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool_module, "MAX_DEATHS", 1)
+    with (
+        pytest.raises(WorkerError, match=r"^2 workers died one after the other"),
+        RayPool(leave, (tmp_path,), 1, address=cluster.address) as pool,
+    ):
+        check_until(pool, lambda: False)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_a_worker_that_raises_stops_the_pool_with_its_line(cluster: Any) -> None:
     with (
         pytest.raises(WorkerError, match=r"^the learning rate is negative$"),
@@ -170,7 +186,7 @@ def test_a_worker_that_raises_stops_the_pool_with_its_line(cluster: Any) -> None
 
 
 def test_workers_that_keep_dying_stop_the_pool(cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_launcher, "MAX_DEATHS", 0)
+    monkeypatch.setattr(pool_module, "MAX_DEATHS", 0)
     with (
         pytest.raises(WorkerError, match=r"^1 workers died one after the other \(WorkerCrashedError"),
         RayPool(die, (), 1, address=cluster.address) as pool,
@@ -192,7 +208,18 @@ def test_a_worker_that_fits_no_node_is_told_once_and_waits(cluster: Any, caplog:
 
 @pytest.mark.parametrize(
     ("where", "is_refused"),
-    [("runs/search", True), ("sqlite:///study.db", True), ("postgresql://u:p@db/x", False), ("grpc://db:13000", False)],
+    [
+        ("runs/search", True),
+        ("sqlite:///study.db", True),
+        ("postgresql://u:p@db/x", False),
+        ("grpc://db:13000", False),
+        ("grpc://127.0.0.1:13000", True),
+        ("postgresql:///x", True),
+        ("postgresql://u@localhost/x", True),
+        ("postgresql://u@/x?host=/var/run/postgresql", True),
+        ("postgresql://u@/x?host=db", False),
+        ("postgresql://u@/x?host=localhost", True),
+    ],
 )
 def test_a_storage_of_this_machine_is_refused_when_nodes_are_on_others(
     where: str, is_refused: bool, monkeypatch: pytest.MonkeyPatch

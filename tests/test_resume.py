@@ -574,6 +574,101 @@ def test_two_trainings_in_one_folder_do_no_harm_to_each_other(tmp_path: Path) ->
     assert not (folder / "checkpoint").exists()
 
 
+def test_a_worker_that_was_taken_for_dead_leaves_later_checkpoints_alone(tmp_path: Path) -> None:
+    environment, settings = CASES["pendulum"]
+    arguments = (environment, LOSS, HYPER | settings, 0, [30, 60, 90], 1)
+    folder = tmp_path / "shared"
+
+    def stop(evaluation: Evaluation) -> None:
+        if evaluation.environment_steps == 90:
+            raise KeyboardInterrupt
+
+    def other(evaluation: Evaluation) -> None:
+        if evaluation.environment_steps == 60:
+            with pytest.raises(KeyboardInterrupt):
+                train_candidate(*arguments, folder, stop)
+            (folder / "checkpoint" / "60").rename(folder / "checkpoint" / "75")  # it is further
+
+    with pytest.raises(KeyboardInterrupt):
+        train_candidate(*arguments, folder, lambda point: (other(point), stop(point))[0])
+    assert sorted(path.name for path in (folder / "checkpoint").iterdir()) == ["60", "75"]
+
+
+def test_a_checkpoint_that_another_worker_takes_away_is_done_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    environment, settings = CASES["pendulum"]
+    arguments = (environment, LOSS, HYPER | settings, 0, [30, 60, 90], 1)
+    undisturbed = train_candidate(*arguments).curve
+    seal, sealed = training.seal, []
+
+    def seal_once(folder: Path, *of: Any) -> None:
+        sealed.append(folder)
+        if len(sealed) == 2:
+            shutil.rmtree(folder.parent)
+        seal(folder, *of)
+
+    monkeypatch.setattr(training, "seal", seal_once)
+    curve = train_candidate(*arguments, tmp_path).curve
+    assert [point[:4] for point in curve] == [point[:4] for point in undisturbed]
+    assert "another worker took it away" in caplog.text and len(sealed) == 2
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory"),
+        RuntimeError("CUDA error: CUDA-capable device(s) is/are busy or unavailable"),
+    ],
+    ids=["memory", "tensor", "gpu"],
+)
+def test_a_checkpoint_waits_for_a_process_that_has_room_for_it(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment, settings = CASES["pendulum"]
+    arguments = (environment, LOSS, HYPER | settings, 0, [30, 60, 90], 1)
+    undisturbed = train_candidate(*arguments).curve
+
+    def stop(evaluation: Evaluation) -> None:
+        if evaluation.environment_steps == 60:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_candidate(*arguments, tmp_path, stop)
+
+    def load(*of: Any, **keywords: Any) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SACAux, "load_replay_buffer", load)
+        with pytest.raises(training.DeviceError, match=r"could not be taken up: (out of memory|the GPU failed)"):
+            train_candidate(*arguments, tmp_path)
+    assert [path.name for path in (tmp_path / "checkpoint").iterdir()] == ["30"]
+    steps = begins(monkeypatch)
+    curve = train_candidate(*arguments, tmp_path).curve
+    assert steps == [30]
+    assert [point[:4] for point in curve] == [point[:4] for point in undisturbed]
+
+
+def test_a_gpu_that_fails_costs_neither_checkpoint_nor_candidate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    environment, settings = CASES["pendulum"]
+    arguments = (environment, LOSS, HYPER | settings, 0, [30, 60, 90], 1, tmp_path)
+    step = SACAux._gradient_step
+
+    def fail(model: SACAux, *of: Any) -> Any:
+        if model.num_timesteps > 40:
+            raise RuntimeError("CUDA error: an illegal memory access was encountered\nCUDA kernel errors might be reported")
+        return step(model, *of)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SACAux, "_gradient_step", fail)
+        with pytest.raises(training.DeviceError, match=r"^the GPU failed: CUDA error: an illegal memory access was"):
+            train_candidate(*arguments)
+    assert [path.name for path in (tmp_path / "checkpoint").iterdir()] == ["30"]
+    assert [point.environment_steps for point in train_candidate(*arguments).curve] == [30, 60, 90]
+
+
 @pytest.mark.parametrize("code", [errno.ESTALE, errno.ENOTCONN, errno.EACCES], ids=errno.errorcode.get)
 def test_a_folder_that_goes_away_is_not_the_candidates_fault(
     code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

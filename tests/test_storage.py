@@ -73,6 +73,9 @@ def table(path: Path) -> None:
         ("sqlite:///own.db", lambda path: path.write_bytes(b"\x7fELF\x00\xff" * 100), "file is not a database"),
         ("sqlite:///own.db", table, "something else than Optuna's studies: history"),
         ("sqlite:///own.db", other_version("v0.9.0.a"), "optuna storage upgrade"),
+        ("sqlite://", Path.touch, "a file that all workers open"),
+        ("sqlite:///:memory:", Path.touch, "a file that all workers open"),
+        ("sqlite:///file:own.db?uri=true", Path.touch, "a file that all workers open"),
         ("sqlite:///own.db", other_version("v99.0.0.a"), "try updating optuna"),
     ],
     ids=lambda value: value if isinstance(value, str) else None,
@@ -82,12 +85,12 @@ def test_what_is_no_storage_is_refused_and_not_touched(
     where: str, write: Callable[[Path], None], message: str, create: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    path = Path(where.rpartition("/")[2])
+    path = Path(where.rpartition("/")[2] or "nothing")
     write(path)
     before = path.is_file() and path.read_bytes()
     with pytest.raises(ValueError, match=message if create or "history" not in message else "no studies") as error:
         open_storage(where, create=create)
-    assert str(path) in str(error.value) and "\n" not in str(error.value)
+    assert where in str(error.value) and "\n" not in str(error.value)
     assert (path.is_file() and path.read_bytes()) == before
 
 
@@ -130,6 +133,8 @@ def test_a_folder_may_be_called_like_a_database(tmp_path: Path, monkeypatch: pyt
         ("grpc://127.0.0.1:13000", "grpc://127.0.0.1:13000"),
         ("postgresql://me@corp:secret@host/db", "postgresql://me@corp:***@host/db"),
         ("postgresql://DOMAIN/me:secret@host/db", "postgresql://DOMAIN/me:***@host/db"),
+        ("host=h password='a'bcd user=me", "host=h password=*** user=me"),
+        ("mssql+pyodbc:///?odbc_connect=UID%3Dme%3BPWD%3Dsecret&x=1", "mssql+pyodbc:///?odbc_connect=***&x=1"),
         ("http://localhost:8080/a@b", "http://localhost:***@b"),  # rather too much
     ],
 )

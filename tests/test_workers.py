@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def test_only_running_trials_of_dead_workers_are_failed() -> None:
     assert workers.fail_dead(study, study.trials) == 0
 
 
-def test_a_copy_of_a_dead_trial_has_time_to_get_the_name_of_its_new_worker() -> None:
+def test_a_copy_of_a_dead_trial_has_time_to_get_the_name_of_its_new_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     process = sleeper()
     dead = workers.identity(process.pid)
     process.communicate()
@@ -82,21 +83,37 @@ def test_a_copy_of_a_dead_trial_has_time_to_get_the_name_of_its_new_worker() -> 
         trial = study.ask()
         trial.set_user_attr(workers.WORKER_KEY, dead)
         study._storage.set_trial_system_attr(trial._trial_id, "failed_trial", 0)
-    trials = study.trials
-    trials[1].datetime_start = datetime.now() - timedelta(minutes=1)
-    assert workers.fail_dead(study, trials) == 1
-    assert [trial.state for trial in study.trials] == [TrialState.RUNNING, TrialState.FAIL]
+    trials, now = study.trials, time.monotonic()
+    trials[0].datetime_start = datetime.now() - timedelta(hours=1)  # by the clock of another machine
+    assert workers.fail_dead(study, trials) == 0
+    monkeypatch.setattr(time, "monotonic", lambda: now + 9)
+    assert workers.fail_dead(study, trials) == 0
+    monkeypatch.setattr(time, "monotonic", lambda: now + 12)
+    assert workers.fail_dead(study, trials) == 2
 
 
-def test_a_worker_that_died_before_it_gave_its_name_is_found_by_the_age_of_its_trial() -> None:
+@pytest.mark.parametrize("hours", [-8, 0, 8])
+def test_a_worker_that_died_before_it_gave_its_name_is_found_whatever_its_clock(
+    hours: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     study = optuna.create_study()
     study.ask()
+
+    def look(all_have_names: bool = True) -> int:
+        trials = study.trials
+        for trial in trials:
+            trial.datetime_start = datetime.now() + timedelta(hours=hours)
+        return workers.fail_dead(study, trials, all_have_names)
+
+    now = time.monotonic()
+    assert look() == 0
+    monkeypatch.setattr(time, "monotonic", lambda: now + workers.UNNAMED_SECONDS - 1)
     study.ask()
-    trials = study.trials
-    trials[1].datetime_start = datetime.now() - timedelta(seconds=workers.UNNAMED_SECONDS + 1)
-    assert workers.fail_dead(study, trials) == 0  # a user's own study, whose workers have no names
-    assert workers.fail_dead(study, trials, all_have_names=True) == 1
-    assert [trial.state for trial in study.trials] == [TrialState.RUNNING, TrialState.FAIL]
+    assert look() == 0
+    monkeypatch.setattr(time, "monotonic", lambda: now + workers.UNNAMED_SECONDS + 1)
+    assert look(all_have_names=False) == 0  # a user's own study, whose workers have no names
+    assert look() == 1
+    assert [trial.state for trial in study.trials] == [TrialState.FAIL, TrialState.RUNNING]
 
 
 def test_failing_a_trial_that_has_finished_changes_nothing() -> None:
