@@ -574,7 +574,7 @@ def dashboard(
         opened = open_storage(storage or str(folder), create=False)
         for found in opened.get_all_studies():
             name = found.study_name
-            if is_search(load_study(opened, name)):  # one that was interrupted has an old plot
+            if is_search(found):  # one that was interrupted has an old plot
                 update_plots(load_study(opened, name), stored_baselines(opened, name))
         console.print(f"http://{host}:{port}/  (Ctrl-C to stop)", highlight=False)
         serve(opened, (folder or Path("runs")) / ARTIFACTS, host, port)
@@ -875,11 +875,8 @@ def main() -> None:
     """Run the program."""
     for before, argument in pairwise(sys.argv):
         # Refused here: what does not fit is repeated in error messages.
-        if (
-            "://" in argument
-            and storage_name(argument) != argument
-            and not (before == "--storage" or argument.startswith("--storage="))
-        ):
+        is_option = before == "--storage" or argument.startswith("--storage=")
+        if "://" in argument and not is_option and storage_name(argument) != "".join(argument.split()):
             errors.print(f"Error: {storage_name(argument)}: a storage goes behind --storage", style="red", markup=False)
             sys.exit(2)
     app()

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import optuna
 import yaml
+from optuna.study._frozen import FrozenStudy
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
@@ -19,7 +20,7 @@ from search import grid, workers
 from search.config import SearchConfig, load_config
 from search.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts, update_plots
 from search.objective import CandidateFailed, DiskError, Objective, causes, check_study, disk_problem, make_pruner
-from search.pool import Pool, uninterrupted
+from search.pool import Pool, Unfit, WorkerError, uninterrupted
 from search.provenance import provenance
 from search.sampler import AuxLossSampler, SearchComplete, StageProgress
 from search.storage import HEARTBEAT_INTERVAL, PATIENCE, Outlasting, ServerLost, load_study, open_storage
@@ -111,7 +112,7 @@ def keep_config(study: optuna.Study, config: SearchConfig) -> None:
         study.set_user_attr(CONFIG_KEY, texts)
 
 
-def is_search(study: optuna.Study) -> bool:
+def is_search(study: optuna.Study | FrozenStudy) -> bool:
     """
     Whether a study has the configuration of a search, and not something else under that name.
 
@@ -222,9 +223,8 @@ def run_worker(name: str, folder: Path, where: str, heartbeat: int) -> None:
             for cause in causes(error):
                 if isinstance(cause, ServerLost):  # Optuna stumbles over what follows from it
                     raise cause from None
-                if isinstance(cause, DeviceError):  # the pool starts another process, which takes the candidate up
-                    logger.error("This worker ends: %s", cause)
-                    raise SystemExit(1) from None
+                if isinstance(cause, DeviceError):
+                    raise Unfit(str(cause)) from None
             with _explained(study, name, folder):
                 raise
 
@@ -234,6 +234,8 @@ def _explained(study: optuna.Study, name: str, folder: Path) -> Iterator[None]:
     """Say what is behind errors that a user can mend: a full disk, a study that somebody deleted."""
     try:
         yield
+    except WorkerError:  # it is explained
+        raise
     except Exception as error:
         if problem := disk_problem(error, folder):
             raise DiskError(problem) from None
@@ -299,7 +301,7 @@ def join(
     while True:
         try:
             storage = open_storage(where, create=False)
-            searches = [study.study_name for study in storage.get_all_studies() if CONFIG_KEY in study.user_attrs]
+            searches = [study.study_name for study in storage.get_all_studies() if is_search(study)]
             study = load_study(storage, searches[0] if name is None and len(searches) == 1 else name)
             if CONFIG_KEY in study.user_attrs or time.monotonic() > deadline:
                 break

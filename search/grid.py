@@ -20,7 +20,7 @@ from search import workers
 from search.config import SearchConfig
 from search.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts
 from search.objective import CandidateFailed, DiskError, Objective, disk_problem
-from search.pool import WorkerPool, uninterrupted
+from search.pool import Unfit, WorkerPool, uninterrupted
 from search.provenance import provenance
 from search.storage import PATIENCE, open_storage, study_id
 from search.training import DeviceError, check_actions
@@ -212,11 +212,11 @@ def run(grid: Runs, folder: Path, where: str, n_workers: int = 1, threads: int |
     yield finished, failed
     while finished < len(grid.cells):
         with WorkerPool(_run_worker, (grid, folder, where), n_workers, threads) as pool:
-            busy, ended = True, -1
+            busy, ended, before = True, _ended(study), -1
             while busy:
                 time.sleep(POLL_SECONDS)
-                busy = pool.check(progressed=finished + failed > ended)
-                ended = finished + failed
+                busy = pool.check(progressed=ended > before)
+                before, ended = ended, _ended(study)
                 finished, failed = _count(study, grid.cells)
                 yield finished, failed
         while not _enqueue(study, grid.cells):
@@ -296,6 +296,12 @@ def _count(study: optuna.Study, cells: Sequence[Cell]) -> tuple[int, int]:
     return len(finished & set(cells)), sum(trial.state == TrialState.FAIL for trial in trials)
 
 
+def _ended(study: optuna.Study) -> int:
+    """How many trials have ended, other than by a death."""
+    trials = study.get_trials(deepcopy=False)
+    return sum(trial.state.is_finished() and not trial.user_attrs.get(workers.DIED_KEY) for trial in trials)
+
+
 def _cell_of(trial: FrozenTrial | optuna.Trial) -> Cell | None:
     if not set(Cell._fields) <= set(trial.user_attrs):
         return None
@@ -336,8 +342,8 @@ def _run_worker(grid: Runs, folder: Path, where: str) -> None:
         except Exception as error:
             if workers.was_failed(error):
                 continue
-            if isinstance(error, DeviceError):  # the pool starts another process, which goes on
-                raise SystemExit(1) from None
+            if isinstance(error, DeviceError):
+                raise Unfit(str(error)) from None
             if problem := disk_problem(error, folder):
                 raise DiskError(problem) from None
             raise

@@ -24,7 +24,15 @@ from search.config import SearchConfig
 from search.provenance import commit, cpu
 from search.space import distributions, suggest_aux_loss
 from search.storage import study_id
-from search.training import DeviceError, EnvironmentLost, TrainingError, causes, memory_problem, train_candidate
+from search.training import (
+    DeviceError,
+    EnvironmentLost,
+    TrainingError,
+    causes,
+    device_problem,
+    memory_problem,
+    train_candidate,
+)
 from search.workers import DIED_KEY
 
 # The words of SQLite and PostgreSQL for a disk that cannot be written.
@@ -81,6 +89,7 @@ class Objective:
         :return: Mean AULC over the seeds
         :raises optuna.TrialPruned: for an invalid candidate, before anything is trained, and for a pruned one
         :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
+        :raises DeviceError: when this process cannot train any more; another trial goes on from the last checkpoint
         :raises DiskError: when the disk is full; the trial's candidate goes on from its last checkpoint in another trial
         :raises ValueError: when the study is another one, see :func:`check_study`
         """
@@ -207,8 +216,10 @@ def end_noted(trial: optuna.Trial, folder: Path | None = None) -> Iterator[None]
         if problem is not None:
             _note_interruption(trial)
             raise DiskError(problem) from error
-        told = isinstance(error, DeviceError)
-        reason = (None if told else memory_problem(error)) or (str(error) if isinstance(error, TrainingError) else None)
+        if not isinstance(error, TrainingError) and (problem := device_problem(error)):
+            error = DeviceError(problem)
+        told = str(error) if isinstance(error, TrainingError) else None
+        reason = told if isinstance(error, DeviceError) else memory_problem(error) or told
         if reason is None:
             if isinstance(error, OSError):  # of the folder, such as one on another machine that went away
                 _note_interruption(trial)
@@ -217,7 +228,7 @@ def end_noted(trial: optuna.Trial, folder: Path | None = None) -> Iterator[None]
         if isinstance(error, EnvironmentLost | DeviceError):
             trial.set_user_attr(DIED_KEY, True)
         if isinstance(error, DeviceError):
-            raise
+            raise error
         raise CandidateFailed(reason) from error
 
 

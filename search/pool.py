@@ -1,6 +1,7 @@
 """Worker processes of one machine: started, replaced when they die, stopped together."""
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -20,11 +21,13 @@ from optuna.exceptions import StorageInternalError
 from search.passwords import without_password
 from search.storage import root_cause
 
+logger = logging.getLogger(__name__)
+
 # Deaths of workers in one place, without a trial finished in between, after which the pool gives up.
 MAX_DEATHS = 5
 # Seconds after which the death of a worker is the first of its place again: clusters take machines away now and then.
 LONG_LIFE = 600.0
-# Characters of an error that reach the user: longer ones would fill the pipe, and the worker would wait for ever.
+# Characters of an error that reach the user: longer ones fill the pipe, and the worker waits until somebody looks.
 MESSAGE_LENGTH = 8000
 # Seconds after which a worker that still runs is interrupted again: an exception that falls into a destructor is lost.
 INTERRUPT_SECONDS = 8.0
@@ -32,6 +35,13 @@ INTERRUPT_SECONDS = 8.0
 
 class WorkerError(RuntimeError):
     """A worker stopped with an error, or workers keep dying; the message says why."""
+
+
+class Unfit(Exception):
+    """
+    Raised by what a worker runs where its process cannot go on, such as after an error of its GPU, but another one can. The
+    message says why.
+    """
 
 
 class Pool(Protocol):
@@ -81,21 +91,25 @@ def _work(target: Callable[..., None], arguments: tuple[Any, ...], errors: Any, 
     except KeyboardInterrupt:
         os._exit(128 + _interrupted.get("signal", signal.SIGINT))
     except Exception as error:
-        errors.put(message(error)[:MESSAGE_LENGTH])
+        errors.put((os.getpid(), isinstance(error, Unfit), message(error)))
         os._exit(1)
 
 
 def message(error: BaseException) -> str:
     """
-    What a user is told of an error that stopped a worker: one line where he can mend it, else the traceback.
+    What a user is told of an error that stopped a worker: one line where he can mend it, else the traceback. The middle of
+    what is very long is left out.
 
     :param error: The error
     """
     if isinstance(error, StorageInternalError):  # what the database said stands in the cause
-        return root_cause(error)
-    if isinstance(error, (ValueError, OSError)):
-        return without_password(" ".join(str(error).split()))
-    return without_password("".join(traceback.format_exception(error)))
+        text = root_cause(error)
+    elif isinstance(error, (ValueError, OSError, Unfit)):
+        text = without_password(" ".join(str(error).split()))
+    else:
+        text = without_password("".join(traceback.format_exception(error)))
+    half = MESSAGE_LENGTH // 2
+    return text if len(text) <= MESSAGE_LENGTH else f"{text[:half]} ... {text[-half:]}"
 
 
 _interrupted: dict[str, Any] = {}  # by which signal first, and when last
@@ -156,7 +170,7 @@ class WorkerPool:
     :param arguments: Its arguments, which must be picklable
     :param n_workers: Number of processes
     :param threads: Threads of PyTorch and BLAS in each, None for its share of the cores. GPUs are shared out: with more
-        than one, a worker sees the one that has the fewest others
+        than one, a worker sees the one that failed least, and of these the one that has the fewest others
     """
 
     def __init__(self, target: Callable[..., None], arguments: tuple[Any, ...], n_workers: int, threads: int | None = None):
@@ -172,6 +186,8 @@ class WorkerPool:
         self._started: dict[BaseProcess, float] = {}
         self._gpus = visible_gpus()
         self._gpu_of: dict[BaseProcess, str] = {}
+        self._failures: Counter[str] = Counter()  # of GPUs
+        self._unfit: dict[int | None, str] = {}  # why, by process
         self._n_workers = n_workers
 
     def __enter__(self) -> "WorkerPool":
@@ -184,7 +200,7 @@ class WorkerPool:
         variables = {"OMP_NUM_THREADS": str(self._start[-1]), "MKL_NUM_THREADS": str(self._start[-1])}
         if len(self._gpus) > 1:
             taken = Counter(self._gpu_of[process] for process in self.processes)
-            variables["CUDA_VISIBLE_DEVICES"] = min(self._gpus, key=lambda gpu: taken[gpu])
+            variables["CUDA_VISIBLE_DEVICES"] = min(self._gpus, key=lambda gpu: (self._failures[gpu], taken[gpu]))
         with _environment(**variables):
             process = self._context.Process(target=_work, args=(*self._start, os.getpid()))
             process.start()
@@ -203,19 +219,25 @@ class WorkerPool:
         """
         if progressed:
             self._deaths = dict.fromkeys(self._deaths, 0)
-        for process in list(self.processes):
-            if process.exitcode is None:
-                continue
+        ended = [process for process in self.processes if process.exitcode is not None]
+        while not self._errors.empty():  # what they said before they ended
+            pid, is_unfit, text = self._errors.get()
+            if not is_unfit:
+                raise WorkerError(text)
+            self._unfit[pid] = text
+        for process in ended:
             self.processes.remove(process)
-            self._gpu_of.pop(process)
+            gpu = self._gpu_of.pop(process)
             deaths, lived = self._deaths.pop(process), time.monotonic() - self._started.pop(process)
-            if not self._errors.empty():
-                raise WorkerError(self._errors.get())
             if process.exitcode == 128 + signal.SIGINT:
                 raise KeyboardInterrupt
             if process.exitcode != 0:
+                cause = self._unfit.pop(process.pid, None)
+                if cause is not None:
+                    logger.error("A worker ended, another one goes on: %s", cause)
+                    self._failures[gpu] += 1
                 killed = ": killed, as systems do whose memory runs out" if process.exitcode == -signal.SIGKILL else ""
-                self._add(count_death(deaths, lived, f"exit code {process.exitcode}{killed}"))
+                self._add(count_death(deaths, lived, cause or f"exit code {process.exitcode}{killed}"))
         return bool(self.processes)
 
     def __exit__(self, *exception: Any) -> None:

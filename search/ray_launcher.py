@@ -16,7 +16,7 @@ from typing import Any
 import joblib  # type: ignore[import-untyped]
 
 from search.passwords import storage_name, without_password
-from search.pool import INTERRUPT_SECONDS, WorkerError, _interrupt_again, _interrupt_once, count_death, message
+from search.pool import INTERRUPT_SECONDS, Unfit, WorkerError, _interrupt_again, _interrupt_once, count_death, message
 from search.storage import is_local
 
 try:
@@ -46,7 +46,8 @@ def _work(
     :param threads: Threads of PyTorch
     :param main: Where the program is, which may register environments
     :param cwd: Folder of the program, from which relative paths count; passed over where there is none
-    :return: Node id and process number; then the message of an error, None without one
+    :return: Node id and process number; then the message of an error, the error itself of a process that cannot go on, None
+        without one
     """
     import torch as th
 
@@ -61,6 +62,8 @@ def _work(
         signal.signal(signal.SIGINT, _interrupt_once)
         sys.unraisablehook = _interrupt_again
         target(*arguments)
+    except Unfit as error:
+        yield error
     except Exception as error:
         yield message(error)
     else:
@@ -176,7 +179,7 @@ class RayPool:
                 raise KeyboardInterrupt from None
             except RayTaskError as error:  # before the worker could begin, such as for a module that its node has not
                 raise WorkerError(message(error)) from None
-            except RayError as error:
+            except (RayError, Unfit) as error:
                 self.workers.remove(worker)
                 self._replace(worker, error)
             else:
@@ -197,6 +200,8 @@ class RayPool:
         while ray.wait([worker.task], timeout=0)[0]:
             said = ray.get(next(worker.task))
             if worker.node is not None:
+                if isinstance(said, Unfit):
+                    raise said
                 if said is not None:
                     raise WorkerError(said)
                 return True
@@ -204,8 +209,10 @@ class RayPool:
             worker.started = time.monotonic()
         return False
 
-    def _replace(self, worker: RayWorker, error: RayError) -> None:
-        cause = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+    def _replace(self, worker: RayWorker, error: RayError | Unfit) -> None:
+        cause = str(error) if isinstance(error, Unfit) else f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        if isinstance(error, Unfit):
+            logger.error("A worker ended, another one goes on: %s", cause)
         deaths = count_death(worker.deaths, time.monotonic() - worker.started, cause)
         if not self._finished:
             self._add(deaths)

@@ -152,15 +152,15 @@ def outlast(call: Callable[[], T], is_lost: Callable[[Exception], bool], patienc
 
     :param call: The call
     :param is_lost: Whether an exception says that the server cannot be reached
-    :param patience: Gives the seconds to go on trying after the first failure, 0 for one attempt; asked each time, for it
-        may change while the call waits
+    :param patience: Gives the seconds to go on trying from the beginning of the first attempt, which a proxy's wait for its
+        own database is part of; 0 for one attempt. Asked each time, for it may change while the call waits
     :param server: Its name in messages, without a password
     :raises ServerLost: when time is up
     """
     if _attempts.lost is not None:
         return call()
     _attempts.lost = []
-    began, pause, token = None, PAUSES[0], object()
+    began, lost, pause, token = time.monotonic(), False, PAUSES[0], object()
     try:
         while True:
             tried = datetime.now()
@@ -170,18 +170,18 @@ def outlast(call: Callable[[], T], is_lost: Callable[[Exception], bool], patienc
                 if not is_lost(error):
                     raise
                 now, seconds = time.monotonic(), patience()
-                if began is None:
-                    began = now
+                if not lost:
+                    lost = True
                     if seconds and _away.setdefault(server, token) is token:
                         logger.warning("Cannot reach %s, trying again for %.0f s: %s", server, seconds, root_cause(error))
                 if now - began >= seconds:
-                    tried_for = f", tried for {now - began:.0f} s" if now > began else ""
+                    tried_for = f", tried for {now - began:.0f} s" if seconds else ""
                     raise ServerLost(f"cannot reach {server}{tried_for}: {root_cause(error)}") from None
                 _attempts.lost.append((tried, datetime.now()))
                 time.sleep(min(pause, began + seconds - now))
                 pause = min(2 * pause, PAUSES[1])
             else:
-                if began is not None and _away.pop(server, None) is not None:
+                if lost and _away.pop(server, None) is not None:
                     logger.warning("%s is back after %.0f s", server, time.monotonic() - began)
                 return result
     finally:

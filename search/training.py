@@ -235,7 +235,7 @@ def train_candidate(
             except Exception as error:  # an interruption is none
                 if _was_killed(error, env, eval_env):
                     raise EnvironmentLost("the process of an environment was killed") from error
-                if problem := device_problem(error):
+                if not isinstance(error, DeviceError) and (problem := device_problem(error)):
                     raise DeviceError(problem) from error
                 # The checkpoint waits for a better disk, or a process that has room for it.
                 if store is not None and not isinstance(error, OSError | DeviceError):
@@ -386,14 +386,23 @@ def memory_problem(error: BaseException) -> str | None:
 
 def device_problem(error: BaseException) -> str | None:
     """
-    One line if an error says that a GPU failed, which is not the candidate's fault. None for other errors.
+    One line if an error says that the GPU failed, and it can no longer be used, whatever the candidate. None for other errors.
 
     :param error: The error
     """
     for cause in causes(error):
-        if isinstance(cause, RuntimeError) and "CUDA error" in str(cause) and memory_problem(cause) is None:
+        of_gpu = isinstance(cause, RuntimeError) and any(words in str(cause) for words in ("CUDA error", "cuDNN error"))
+        if of_gpu and memory_problem(cause) is None and not _gpu_computes():
             return "the GPU failed: " + " ".join(str(cause).split())[:300]
     return None
+
+
+def _gpu_computes() -> bool:
+    """Whether this process can use its GPU: after most errors of CUDA it cannot any more."""
+    try:
+        return th.ones(1, device="cuda").item() == 1
+    except (AssertionError, RuntimeError):  # the former without CUDA
+        return False
 
 
 class _RunFolder:
@@ -441,11 +450,13 @@ class _RunFolder:
                     model = SACAux.load(files[MODEL], env, device=device, force_reset=False)
                     model.load_replay_buffer(files["replay_buffer.pkl"])
                     cut_off = about["cut_off"] or _load_simulations(env, pickle.load(files["environments.pkl"]))
-            except (OSError, EOFError):
-                raise  # of the disk, or the process of an environment: they say nothing of the checkpoint
-            except Exception as error:  # what other versions do to pickle and torch
+            except Exception as error:
                 if problem := memory_problem(error) or device_problem(error):
-                    raise DeviceError(f"the checkpoint {newest} could not be taken up: {problem}") from error
+                    message = f"the checkpoint {newest} could not be taken up, remove it to begin anew: {problem}"
+                    raise DeviceError(message) from error
+                if isinstance(error, OSError | EOFError):
+                    raise  # of the disk, or the process of an environment: they say nothing of the checkpoint
+                # What other versions do to pickle and torch.
                 logger.warning("The checkpoint %s is of no use, training begins anew: %s", newest, error)
             else:
                 logger.info("Training goes on after %d environment steps", curve[-1].environment_steps)

@@ -3,9 +3,9 @@
 import itertools
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import optuna
@@ -15,8 +15,9 @@ from optuna.trial import TrialState
 from optuna_dashboard._note import get_note_from_system_attrs
 
 from sb3_aarl import catalog
-from search import cross_validation, evolve, grid, operator_selection, workers
+from search import cross_validation, evolve, grid, objective, operator_selection, pool, training, workers
 from search.config import CrossValidation, SearchConfig
+from search.pool import WorkerError
 from search.storage import load_study, open_storage
 
 HYPERPARAMETERS = Path(__file__).parent.parent / "zoo_configs" / "demo.yml"
@@ -297,6 +298,27 @@ OTHER = "dm_control/reacher-easy-v0"
 def with_checkpoints(*checkpoints: int) -> SearchConfig:
     """The search, whose cross-validation on the other environment is evaluated there."""
     return replace(CONFIG, cross_validation=CrossValidation((CONFIG.environment, OTHER), checkpoints={OTHER: checkpoints}))
+
+
+@dataclass(frozen=True)
+class Broken:
+    """Runs on a machine whose GPU is broken."""
+
+    name = "broken"
+    cells = (grid.Cell("SAC", "Pendulum-v1", 0), grid.Cell("SAC", "Pendulum-v1", 1), grid.Cell("SAC", "Pendulum-v1", 2))
+    trainings: ClassVar[dict[str, Any]] = {}
+
+    def train(self, trial: optuna.Trial, cell: grid.Cell, folder: Path) -> float:
+        with objective.end_noted(trial):
+            raise training.DeviceError("the GPU failed: CUDA error")
+
+
+def test_a_broken_gpu_does_not_use_up_the_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool, "MAX_DEATHS", 1)
+    with pytest.raises(WorkerError, match=r"2 workers died one after the other \(the GPU failed: CUDA error\)"):
+        list(grid.run(Broken(), tmp_path, str(tmp_path)))
+    states = [trial.state for trial in load_study(open_storage(tmp_path), "broken").trials]
+    assert states == [TrialState.FAIL, TrialState.FAIL, TrialState.WAITING]
 
 
 @pytest.mark.parametrize("value", ["yesterday", {"candidates": "all of them"}])

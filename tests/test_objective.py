@@ -1,5 +1,6 @@
 """Training a candidate: reports, pruning, failures that stay its own, and going on after a kill."""
 
+import errno
 import json
 import os
 import shutil
@@ -29,7 +30,8 @@ from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes
 from sb3_aarl.envs import make_dmc_env
 from search import evolve, training, workers
 from search.config import load_config
-from search.objective import CandidateFailed, Objective, make_pruner, mean_curve
+from search.objective import CandidateFailed, DiskError, Objective, disk_problem, make_pruner, mean_curve
+from search.pool import Unfit, WorkerError
 from search.sampler import AuxLossSampler
 from search.space import loss_to_params
 from search.storage import open_storage
@@ -340,9 +342,8 @@ def test_a_worker_whose_gpu_failed_ends_and_another_one_goes_on(tmp_path: Path, 
 
     with monkeypatch.context() as patch:
         patch.setattr("search.objective.train_candidate", fail)
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(Unfit, match=r"^the GPU failed: CUDA error: unspecified launch failure$"):
             evolve.run_worker("search", tmp_path, where, 60)
-    assert ended.value.code == 1
     (failed,) = study.trials
     assert failed.state == TrialState.FAIL and failed.user_attrs["reason"].startswith("the GPU failed: CUDA error")
     run = training.TrainingRun([Evaluation(800, 1.0, 0.0, 1, 0.0)], 1.0)
@@ -372,6 +373,17 @@ def test_a_study_that_somebody_deletes_is_named(kind: str, tmp_path: Path, monke
         evolve.run_worker("search", tmp_path, where, 60)
     with pytest.raises(ValueError, match=message), evolve._explained(study, "search", tmp_path):
         evolve.look(study, sampler)
+
+
+def test_what_a_worker_said_of_its_disk_is_not_explained_again(tmp_path: Path) -> None:
+    problem = disk_problem(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/data/x"))
+    assert problem is not None
+    with pytest.raises(WorkerError) as raised, evolve._explained(optuna.create_study(), "some", tmp_path):
+        raise WorkerError(problem)
+    assert str(raised.value) == problem
+    with pytest.raises(DiskError) as told, evolve._explained(optuna.create_study(), "some", tmp_path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/data/x")  # of this program's own
+    assert str(told.value) == problem
 
 
 def test_a_worker_that_was_taken_for_dead_trains_no_further_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

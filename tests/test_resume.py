@@ -619,9 +619,10 @@ def test_a_checkpoint_that_another_worker_takes_away_is_done_without(
     [
         MemoryError(),
         RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
         RuntimeError("CUDA error: CUDA-capable device(s) is/are busy or unavailable"),
     ],
-    ids=["memory", "tensor", "gpu"],
+    ids=["memory", "tensor", "system", "gpu"],
 )
 def test_a_checkpoint_waits_for_a_process_that_has_room_for_it(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -642,7 +643,8 @@ def test_a_checkpoint_waits_for_a_process_that_has_room_for_it(
 
     with monkeypatch.context() as patch:
         patch.setattr(SACAux, "load_replay_buffer", load)
-        with pytest.raises(training.DeviceError, match=r"could not be taken up: (out of memory|the GPU failed)"):
+        message = r"^the checkpoint .*/30 could not be taken up, remove it to begin anew: (out of memory|the GPU failed)"
+        with pytest.raises(training.DeviceError, match=message):
             train_candidate(*arguments, tmp_path)
     assert [path.name for path in (tmp_path / "checkpoint").iterdir()] == ["30"]
     steps = begins(monkeypatch)
