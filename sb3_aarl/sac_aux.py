@@ -49,6 +49,15 @@ class ExplodedError(FloatingPointError):
     """Q values are far larger than rewards allow; the message says how large they are, may be, and when."""
 
 
+def _computes_bf16(device: th.device) -> bool:
+    """Whether a device has instructions for bfloat16."""
+    if device.type == "cuda":
+        return th.cuda.is_bf16_supported(including_emulation=False)
+    if device.type == "cpu":
+        return th.backends.mkldnn.is_available() and th.ops.mkldnn._is_mkldnn_bf16_supported()
+    return True
+
+
 class SACAux(SAC):
     """
     Soft Actor-Critic with an auxiliary loss on its encoder (AARL), around SB3's SAC.
@@ -108,7 +117,9 @@ class SACAux(SAC):
         and shifts if not. Vectors are never augmented
     :param crop_size: Height and width in pixels of cropped images, None for 84. Where it is given, images must not be smaller
     :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16, while parameters, optimizers,
-        Q targets, entropy and losses stay float32. Predictions are made in float32
+        Q targets, entropy and losses stay float32. Predictions are made in float32. It is faster where the device has
+        instructions for bfloat16, and many times slower where it has not, which one line of log says: of x86 processors
+        those without AVX-512
     :param compile: ``"cudagraphs"``: on a GPU, the gradient step is one captured CUDA graph. Elsewhere, or where it cannot be
         captured, one line of log says so and the step runs as it does with None. What is no tensor (``gamma``, ``tau``,
         ``aux_coef``) keeps the value of the capture; learning rates may change. It cannot be used with gSDE
@@ -274,6 +285,8 @@ class SACAux(SAC):
             rate = self.ent_coef_schedule(1)
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=rate, betas=self.ent_coef_betas)
         self._setup_aux_loss(own_buffer)
+        if self.precision == "bf16" and not _computes_bf16(self.device):
+            logger.warning("precision='bf16': this %s has no instructions for it, fp32 is faster", self.device.type.upper())
         self._graphed_step = None
         if self.compile is not None:
             if self.device.type != "cuda":

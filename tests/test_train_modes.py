@@ -2,6 +2,8 @@
 
 import copy
 import logging
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from test_sac_aux import KINDS, assert_same, everything, filled_model, make_mode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
+from sb3_aarl import sac_aux
 from sb3_aarl.cuda_graph import _key, _leaves, _map
 from sb3_aarl.sac_aux import NonFiniteError
 
@@ -29,6 +32,24 @@ class Operations(TorchDispatchMode):
         inputs = {arg.dtype for arg in args if isinstance(arg, th.Tensor) and arg.is_floating_point()}
         self.seen.setdefault(str(function).rpartition(".")[0], set()).update(inputs)
         return function(*args, **(kwargs or {}))
+
+
+def test_bfloat16_without_instructions_for_it_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    flags = (
+        re.search(r"^flags\s*:(.*)", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        if Path("/proc/cpuinfo").exists()
+        else None
+    )
+    if flags is not None:  # Linux on x86
+        assert sac_aux._computes_bf16(th.device("cpu")) == ({"avx512bw", "avx512vl", "avx512dq"} <= set(flags[1].split()))
+    for computes, precision, told in ((False, "bf16", True), (True, "bf16", False), (False, "fp32", False)):
+        monkeypatch.setattr(sac_aux, "_computes_bf16", lambda device, computes=computes: computes)
+        caplog.clear()
+        make_model(precision=precision)
+        expected = ["precision='bf16': this CPU has no instructions for it, fp32 is faster"] * told
+        assert [record.getMessage() for record in caplog.records] == expected
 
 
 @pytest.mark.parametrize("kind", KINDS)
