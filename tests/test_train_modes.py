@@ -42,7 +42,7 @@ def test_bfloat16_without_instructions_for_it_is_told(
         if Path("/proc/cpuinfo").exists()
         else None
     )
-    if flags is not None:  # Linux on x86
+    if flags is not None and "avx_ne_convert" not in flags[1]:  # Linux on x86; with that one it depends on the version
         assert sac_aux._computes_bf16(th.device("cpu")) == ({"avx512bw", "avx512vl", "avx512dq"} <= set(flags[1].split()))
     for computes, precision, told in ((False, "bf16", True), (True, "bf16", False), (False, "fp32", False)):
         monkeypatch.setattr(sac_aux, "_computes_bf16", lambda device, computes=computes: computes)
