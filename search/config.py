@@ -5,6 +5,7 @@ import copy
 import difflib
 import functools
 import inspect
+import itertools
 import math
 import re
 import reprlib
@@ -30,9 +31,10 @@ from sb3_aarl.policies import SACAuxPolicy
 
 # Values in a file, aliases written out; and numbers of candidates, stages and the like.
 LARGEST = 100_000
-# Characters of a file, which PyYAML reads in a second, and of an error.
+# Characters of a file, which PyYAML reads in a second, and of an error; brackets within brackets.
 LONGEST_FILE = 200_000
 LONGEST_ERROR = 1000
+DEEPEST = 100
 PRUNERS = ("none", "median", "hyperband")
 # How several environments run, under the names of RL-Zoo's option --vec-env.
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
@@ -356,6 +358,9 @@ def _read(path: Path) -> dict[str, Any]:
 @functools.lru_cache(maxsize=8)  # a search asks for the hyper-parameters of each environment and each baseline
 def _parse(text: str) -> dict[str, Any]:
     """The mapping in a text of YAML."""
+    # PyYAML looks ahead at every bracket, for seconds where they are many.
+    if max(itertools.accumulate((char in "[{") - (char in "]}") for char in text), default=0) > DEEPEST:
+        raise ConfigError(f"brackets are nested more than {DEEPEST} deep")
     try:
         values = yaml.load(text, _Loader)
     except Exception as error:  # beside YAMLError, PyYAML lets through whatever goes wrong with a value: 2020-13-45, !!int ""
