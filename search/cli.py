@@ -65,15 +65,16 @@ def _one_line(error: Exception) -> str | None:
     """What a user is told of an error that he can mend, without passwords; None for others."""
     from search.training import TrainingError
 
+    line = without_password(" ".join(str(error).split()))
     if isinstance(error, (ValueError, OSError, TrainingError)):
-        return without_password(" ".join(str(error).split()))
+        return line
     if "search.pool" in sys.modules:  # else it is not of Optuna, which a training alone does without
         from optuna.exceptions import StorageInternalError
 
         from search.pool import WorkerError, message
 
         if isinstance(error, WorkerError):
-            return without_password(" ".join(str(error).split()))
+            return line
         if isinstance(error, StorageInternalError):
             return message(error)
     return None

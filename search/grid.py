@@ -208,21 +208,23 @@ def run(grid: Runs, folder: Path, where: str, n_workers: int = 1, threads: int |
     settings = {f"{name}s": ", ".join(dict.fromkeys(str(getattr(cell, name)) for cell in grid.cells)) for name in Cell._fields}
     annotate_study(study, settings | grid.trainings, provenance(), is_search=False)
     _enqueue(study, grid.cells)
-    finished, failed = _count(study, grid.cells)
+    finished, failed = _count(study.get_trials(deepcopy=False), grid.cells)
     yield finished, failed
     while finished < len(grid.cells):
         with WorkerPool(_run_worker, (grid, folder, where), n_workers, threads) as pool:
-            busy, ended, before = True, _ended(study), -1
+            busy, ended, before = True, _ended(study.get_trials(deepcopy=False)), -1
             while busy:
                 time.sleep(POLL_SECONDS)
                 busy = pool.check(progressed=ended > before)
-                before, ended = ended, _ended(study)
-                finished, failed = _count(study, grid.cells)
+                trials = study.get_trials(deepcopy=False)
+                before, ended = ended, _ended(trials)
+                finished, failed = _count(trials, grid.cells)
                 yield finished, failed
         while not _enqueue(study, grid.cells):
             annotate_ended(study, artifacts(folder))
             running = study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.WAITING))
-            finished, failed = _count(study, grid.cells)  # after that: none of these is overlooked
+            # After that: none of these is overlooked.
+            finished, failed = _count(study.get_trials(deepcopy=False), grid.cells)
             yield finished, failed
             if finished == len(grid.cells) or not running:
                 return
@@ -290,15 +292,13 @@ def _enqueue(study: optuna.Study, cells: Sequence[Cell]) -> int:
     return len(missing)
 
 
-def _count(study: optuna.Study, cells: Sequence[Cell]) -> tuple[int, int]:
-    trials = study.get_trials(deepcopy=False)
+def _count(trials: Sequence[FrozenTrial], cells: Sequence[Cell]) -> tuple[int, int]:
     finished = {_cell_of(trial) for trial in trials if trial.state == TrialState.COMPLETE}
     return len(finished & set(cells)), sum(trial.state == TrialState.FAIL for trial in trials)
 
 
-def _ended(study: optuna.Study) -> int:
-    """How many trials have ended, other than by a death."""
-    trials = study.get_trials(deepcopy=False)
+def _ended(trials: Sequence[FrozenTrial]) -> int:
+    """How many have ended, other than by a death."""
     return sum(trial.state.is_finished() and not trial.user_attrs.get(workers.DIED_KEY) for trial in trials)
 
 

@@ -234,6 +234,11 @@ def wait_for_the_end(folder: Path) -> None:
         time.sleep(0.01)
 
 
+def kill_first(pool: WorkerPool) -> None:
+    pool.processes[0].kill()
+    pool.processes[0].join()
+
+
 def test_workers_that_are_killed_all_at_once_are_all_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pool_module, "MAX_DEATHS", 1)
     with WorkerPool(wait_for_the_end, (tmp_path,), n_workers=3, threads=1) as pool:
@@ -247,8 +252,7 @@ def test_workers_that_are_killed_all_at_once_are_all_replaced(tmp_path: Path, mo
         assert pool.check(progressed=False)
         assert len(pool.processes) == 3 and not set(before) & set(pool.processes)
         # Two deaths in one place, without a trial in between, are too many.
-        pool.processes[0].kill()
-        pool.processes[0].join()
+        kill_first(pool)
         with pytest.raises(WorkerError, match="2 workers died one after the other"):
             pool.check(progressed=False)
         (tmp_path / "done").touch()
@@ -260,13 +264,11 @@ def test_a_worker_that_lived_long_is_the_first_that_died(tmp_path: Path, monkeyp
     monkeypatch.setattr(pool_module, "LONG_LIFE", 0.0)
     with WorkerPool(wait_for_the_end, (tmp_path,), n_workers=1, threads=1) as pool:
         for _ in range(3):
-            (process,) = pool.processes
-            process.kill()
-            process.join()
+            assert len(pool.processes) == 1
+            kill_first(pool)
             assert pool.check(progressed=False)
         monkeypatch.setattr(pool_module, "LONG_LIFE", 600.0)
-        pool.processes[0].kill()
-        pool.processes[0].join()
+        kill_first(pool)
         with pytest.raises(WorkerError, match=r"2 workers died one after the other \(exit code -9: killed, as .*memory"):
             pool.check(progressed=False)
         (tmp_path / "done").touch()
@@ -295,8 +297,7 @@ def test_a_finished_trial_forgets_deaths(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(pool_module, "MAX_DEATHS", 1)
     with WorkerPool(wait_for_the_end, (tmp_path,), n_workers=1, threads=1) as pool:
         for _ in range(3):
-            (process,) = pool.processes
-            process.kill()
-            process.join()
+            assert len(pool.processes) == 1
+            kill_first(pool)
             assert pool.check(progressed=True)
         (tmp_path / "done").touch()
