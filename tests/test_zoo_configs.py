@@ -150,6 +150,8 @@ def test_rl_zoo_reads_the_same(variant: str) -> None:
         assert entry == load_hyperparameters(path, env_id), env_id
 
 
+# Batch and hidden layers of SB3's SAC.
+SMALL: dict[str, Any] = {"batch_size": 256, "policy_kwargs": {"net_arch": [256, 256]}}
 # What each file of choices/ changes, and of which variant.
 CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "aarl_state_bf16": ("aarl_state", {"precision": "bf16"}),
@@ -169,6 +171,17 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "sac_identity_bf16_orthogonal_squashed": (
         "sac_identity",
         {"precision": "bf16", "policy_kwargs": {"ortho_init": True, "squash_log_std": (-10, 2)}},
+    ),
+    "aarl_state_small": ("aarl_state", SMALL),
+    "aarl_state_small_joint": ("aarl_state", {**SMALL, "joint_optimizer": True}),
+    "aarl_state_small_predictor": ("aarl_state", {**SMALL, "predictor_width": None, "predictor_batch_norm": True}),
+    "aarl_state_small_separate": ("aarl_state", merge(SMALL, {"policy_kwargs": {"share_features_extractor": False}})),
+    "sac_dense_mlp_small": ("sac_dense_mlp", SMALL),
+    "sac_identity_small": ("sac_identity", SMALL),
+    "sac_identity_small_orthogonal": ("sac_identity", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
+    "sac_identity_small_orthogonal_squashed": (
+        "sac_identity",
+        merge(SMALL, {"policy_kwargs": {"ortho_init": True, "squash_log_std": (-10, 2)}}),
     ),
 }
 
