@@ -93,7 +93,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
         yield f"| {' | '.join(cells)} |"
     yield "\nMade by, and made again by (`--out` another folder):\n"
     yield "```bash"
-    yield from dict.fromkeys(command(about) for _, about in finished)
+    yield from commands(about for _, about in finished)
     yield "```\n"
     yield from cost([about for _, about in finished])
 
@@ -137,19 +137,23 @@ def paper(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
             yield f"The public code there, one run (not ours, its curves are not here): {REFERENCE[environment, step]}.\n"
 
 
-def command(about: dict[str, Any]) -> str:
+def commands(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
     """
-    The command that trains a run again.
+    The commands that train runs again, one for all seeds of a variant on a task.
 
-    :param about: What stands beside its curve
+    :param abouts: What stands beside their curves
     """
-    steps = about["evaluations"]
-    between = sorted(set(steps) - set(about["checkpoints"]))
-    words = ["aarl", "benchmark", about["file"], "--envs", task_name(about["environment"]), "--seeds", str(about["seed"])]
-    words += ["--checkpoints", ",".join(map(str, about["checkpoints"]))]
-    words += ["--every", str(between[0])] if between else []
-    words += ["--episodes", str(about["evaluation_episodes"]), "--threads", str(about["sessions"][-1]["threads"])]
-    return shlex.join(words)
+    seeds: dict[tuple[str, str], list[int]] = {}
+    for about in abouts:
+        steps = about["evaluations"]
+        between = sorted(set(steps) - set(about["checkpoints"]))
+        before = ["aarl", "benchmark", about["file"], "--envs", task_name(about["environment"])]
+        after = ["--checkpoints", ",".join(map(str, about["checkpoints"]))]
+        after += ["--every", str(between[0])] if between else []
+        after += ["--episodes", str(about["evaluation_episodes"]), "--threads", str(about["sessions"][-1]["threads"])]
+        seeds.setdefault((shlex.join(before), shlex.join(after)), []).append(about["seed"])
+    for (variant, settings), numbers in seeds.items():
+        yield f"{variant} --seeds {','.join(map(str, sorted(numbers)))} {settings}"
 
 
 def cost(abouts: list[dict[str, Any]]) -> Iterator[str]:
