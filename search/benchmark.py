@@ -122,6 +122,7 @@ class Benchmark:
                 path,
             )
         trial.set_user_attr("curve", mean_curve([run.curve]))
+        session["aux_loss"] = run.aux_loss
         write_about(path, {**about, "seconds": run.curve[-1].seconds})
         return run.aulc
 

@@ -516,31 +516,16 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
     wide = Console(width=1000)  # as wide as a table is: cut numbers are wrong ones
     for shown in [*tables.score_tables(comparison), *tables.statistics_tables(iqm, better)]:
         wide.print(shown)
-    if (iqm["runs"] < 4).any():
-        console.print(
-            "The interquartile mean of fewer than four runs is their mean, and its interval goes from the smallest to the "
-            "largest.",
-            highlight=False,
-        )
-    if comparison["paper_mean"].notna().any():
-        console.print(
-            f"Paper: table {number}. ▲ ▼: the difference from it is more than two standard errors of the difference, "
-            "2 sqrt(s²/n + S²/N).",
-            highlight=False,
-        )
+    for line in tables.footnotes(number, comparison, iqm, better):
+        console.print(line, highlight=False)
     _show_missing(runs)
-    commits = tables.commits(runs)
-    if len(commits) > 1:
-        of_each = "; ".join(f"{commit} ({count})" for commit, count in commits.items())
-        notice = f"Runs of several commits or versions: {of_each}"
-        console.print(notice, style="red", markup=False, soft_wrap=True, highlight=False)
 
 
 def _show_missing(runs: "pd.DataFrame") -> None:
-    """What a benchmark was asked for and does not have."""
+    """What a benchmark was asked for and does not have, and what in it should not be compared."""
     from search import table as tables
 
-    for line in tables.missing(runs):
+    for line in tables.missing(runs) + tables.mixed(runs):
         console.print(line, style="red", markup=False, soft_wrap=True, highlight=False)
 
 

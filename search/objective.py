@@ -21,7 +21,7 @@ from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation
 from search.checkpoint import is_disk_error
 from search.config import SearchConfig
-from search.provenance import commit, cpu
+from search.provenance import commit, cpu, versions
 from search.space import distributions, suggest_aux_loss
 from search.storage import study_id
 from search.training import (
@@ -60,10 +60,10 @@ class Objective:
     seeds it is the curve of the first one that is reported: trials are compared like with like, and a pruned one is
     spared its other seeds.
 
-    User attributes of a trial: ``loss`` (notation), ``canonical``, ``environment``, ``commit``, ``device`` (name of the GPU
-    or the processor), ``threads``; ``curve`` (a list of [environment steps, mean, standard deviation] over the episodes
-    of all seeds) and ``seconds`` of training when it ends; ``seeds_trained`` from the second seed on; ``reason`` when it
-    fails, and ``died`` where the process of an environment or a GPU did; ``interrupted`` when Ctrl-C or a full disk
+    User attributes of a trial: ``loss`` (notation), ``canonical``, ``environment``, ``commit``, ``versions``, ``device`` (name
+    of the GPU or the processor), ``threads``; ``curve`` (a list of [environment steps, mean, standard deviation] over the
+    episodes of all seeds) and ``seconds`` of training when it ends; ``seeds_trained`` from the second seed on; ``reason`` when
+    it fails, and ``died`` where the process of an environment or a GPU did; ``interrupted`` when Ctrl-C or a full disk
     stopped it.
 
     ``study.optimize(objective, catch=CandidateFailed)`` goes on after a candidate that failed.
@@ -80,7 +80,6 @@ class Objective:
         self.config = config
         self.on_begin = on_begin
         self.folder = Path(folder)
-        self.commit = commit()
         self._checked: tuple[Any, int] | None = None
 
     def __call__(self, trial: optuna.Trial) -> float:
@@ -145,7 +144,8 @@ class Objective:
             "loss": "none" if aux_loss is None else str(aux_loss),
             "canonical": "none" if aux_loss is None else str(aux_loss.canonical()),
             "environment": environment,
-            "commit": self.commit,
+            "commit": commit(),
+            "versions": versions(),
             "device": device_name(hyperparameters.get("device", "auto")),
             "threads": th.get_num_threads(),
         }

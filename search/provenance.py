@@ -1,5 +1,6 @@
 """Where a number comes from: commit, versions, machine and command, as plain values for JSON and notes."""
 
+import functools
 import hashlib
 import json
 import os
@@ -23,10 +24,11 @@ ABOUT = "provenance.json"
 PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "shimmy", "optuna", "numpy")
 
 
+@functools.cache
 def commit() -> str:
     """
     The commit of this checkout, with ``+changes.`` and a hash of them if files differ from it; the version where there is
-    no checkout.
+    no checkout. It is looked up once: a process keeps the code that it has begun with, whatever is checked out later.
     """
     root = Path(__file__).parent.parent
 
@@ -52,14 +54,20 @@ def cpu() -> str:
     return f"{name}, {cores} cores"
 
 
-def provenance() -> dict[str, str]:
-    """What has to stand beside every figure: commit, command, date, hardware, versions."""
-    versions = []
+@functools.cache
+def versions() -> str:
+    """The packages that a figure depends on, those that are there."""
+    found = []
     for package in PACKAGES:
         try:
-            versions.append(f"{package} {metadata.version(package)}")
+            found.append(f"{package} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
             continue
+    return ", ".join(found)
+
+
+def provenance() -> dict[str, str]:
+    """What has to stand beside every figure: commit, command, date, hardware, versions."""
     return {
         "commit": commit(),
         # It stands in notes and reports, which others read.
@@ -68,7 +76,7 @@ def provenance() -> dict[str, str]:
         "cpu": cpu(),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else "none",
         "python": platform.python_version(),
-        "versions": ", ".join(versions),
+        "versions": versions(),
     }
 
 

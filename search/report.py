@@ -149,7 +149,7 @@ def write_report(
     :param path: Where the HTML file goes; its folder is made if it is not there
     :param baselines: Names and scores to compare with
     :param settings: Names and values of the search's settings; None for what the study itself has noted
-    :param provenance: As ``search.provenance.provenance`` gives it
+    :param provenance: Of the report, as ``search.provenance.provenance`` gives it
     :param validation: Runs of the cross-validation, as :func:`stored_runs` gives them
     :param benchmark: Folder of a benchmark whose tables and learning curves are shown too
     :raises ValueError: when there is no benchmark in the folder
@@ -189,6 +189,7 @@ def write_report(
         ended=max((_minute(trial.datetime_complete) for trial in trials if trial.datetime_complete), default=""),
         sampler=study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY, {}),
         settings=dict(settings),
+        versions=dict(Counter(str(trial.user_attrs["versions"]) for trial in trials if "versions" in trial.user_attrs)),
         provenance=dict(provenance or {}),
     )
     replace_text(Path(path), html)
@@ -233,12 +234,13 @@ def _benchmark(folder: Path) -> dict[str, Any]:
     number = tables.closest_table(runs["variant"])
     runs = tables.in_order(runs, number)
     comparison = tables.compare(runs, number)
-    shown = tables.statistics_tables(tables.interquartile_means(runs), tables.improvements(runs))
+    iqm, better = tables.interquartile_means(runs), tables.improvements(runs)
+    shown = tables.statistics_tables(iqm, better)
     return {
         "folder": folder,
-        "number": number if comparison["paper_mean"].notna().any() else None,
         "tables": [(str(table.title), _frame(table)) for table in (*tables.score_tables(comparison), *shown)],
-        "missing": tables.missing(runs),
+        "footnotes": tables.footnotes(number, comparison, iqm, better),
+        "missing": tables.missing(runs) + tables.mixed(runs),
         "curves": _picture(learning_curves_plot(read_curves(folder))),
     }
 
@@ -433,7 +435,7 @@ top candidates should be trained again with other seeds)
 {% endif %}
 {% if validation %}
 <h2>Cross-validation</h2>
-<p>The best of the search, trained again: AULC on each environment, mean and deviation over all runs.
+<p>The best of the search, trained again: AULC on each environment, their mean, and its deviation over the seeds.
 {% if validation[1] %}{{ validation[1] }} without all runs are left out.{% endif %}</p>
 {{ table(validation[0]) }}
 {% endif %}
@@ -481,9 +483,10 @@ checkpoint, the return at the last one.</figcaption></figure>
 {% endif %}
 {% if benchmark %}
 <h2>Benchmark</h2>
-<p>Mean and deviation over the seeds, as measured in {{ benchmark.folder }}.
-{% if benchmark.number %}Beside them the paper's table {{ benchmark.number }}; ▲ ▼: they differ by more than two standard
-errors of the difference.{% endif %}</p>
+<p>Mean and deviation over the seeds, as measured in {{ benchmark.folder }}.</p>
+{% for line in benchmark.footnotes %}
+<p class="note">{{ line }}</p>
+{% endfor %}
 {% for line in benchmark.missing %}
 <p><strong>{{ line }}</strong></p>
 {% endfor %}
@@ -502,7 +505,8 @@ errors of the difference.{% endif %}</p>
 {% endif %}
 {{ values("Settings", settings) }}
 {{ values("Settings of the sampler", sampler) }}
-{{ values("Where it comes from", provenance) }}
+{{ values("Versions of packages, by trials", versions) }}
+{{ values("What wrote this report", provenance) }}
 </body>
 </html>
 """)

@@ -232,25 +232,26 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
     percentiles over resamples of the seeds within each task.
 
     The IQM is over returns as they are, so only over tasks of one scale: those of DeepMind Control (0 to 1000) together,
-    each other environment for itself. Only tasks count that all variants of the checkpoint have runs on; variants without
-    any run are left out.
+    each other environment for itself. Only tasks count that all variants of the checkpoint have runs on, and of each variant
+    the seeds that it has on all of them, so that every task weighs the same; variants without any run are left out.
 
     :param runs: As :func:`read_runs` gives them
     :param n_resamples: Resamples of the bootstrap
-    :return: One row for each ``checkpoint``, ``tasks`` (of which scale) and ``variant``: ``n_tasks``, ``asked``, ``runs``,
-        ``iqm``, ``low`` and ``high`` (NaN where a task has one run only)
+    :return: One row for each ``checkpoint``, ``tasks`` (of which scale) and ``variant``: ``n_tasks``, ``asked``, ``runs`` that
+        count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has one run only)
     """
     rows = []
     scale = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
     for (checkpoint, tasks), of_scale in runs.groupby(["checkpoint", scale], sort=False):
         common, scores = _scores(of_scale)
-        for variant, samples in scores.items():
-            if not common:
-                continue
-            asked = of_scale[(of_scale["variant"] == variant) & of_scale["environment"].isin(common)]
+        of_common = of_scale[of_scale["environment"].isin(common)]
+        for variant in scores:
+            asked = of_common[of_common["variant"] == variant]
+            matrix = asked.pivot(index="environment", columns="seed", values="mean").dropna(axis="columns")
+            samples = list(matrix.to_numpy())
             interval = _interval(samples, _iqm, n_resamples)
-            runs_there = sum(map(len, samples))
-            rows.append((checkpoint, tasks, variant, len(common), len(asked), runs_there, _iqm(*samples), *interval))
+            iqm = _iqm(*samples) if matrix.size else math.nan
+            rows.append((checkpoint, tasks, variant, len(common), len(asked), matrix.size, iqm, *interval))
     columns = ["checkpoint", "tasks", "variant", "n_tasks", "asked", "runs", "iqm", "low", "high"]
     return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
 
@@ -340,6 +341,17 @@ def commits(runs: pd.DataFrame) -> dict[str, int]:
     return {str(name): int(count) for name, count in pd.concat([counts, several]).items() if name}
 
 
+def mixed(runs: pd.DataFrame) -> list[str]:
+    """
+    A line if runs were trained with several commits or versions, as :func:`commits` counts them.
+
+    :param runs: As :func:`read_runs` gives them
+    """
+    counts = commits(runs)
+    of_each = "; ".join(f"{commit} ({count})" for commit, count in counts.items())
+    return [f"Runs of several commits or versions: {of_each}"] if len(counts) > 1 else []
+
+
 def score_tables(comparison: pd.DataFrame) -> list[Table]:
     """
     The layout of the paper: for each checkpoint tasks as rows, variants as columns, the paper's score beside each.
@@ -382,7 +394,8 @@ def statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
         for row in part.to_dict("records"):
             scale = f"{SUITE}, {row['n_tasks']} tasks" if row["n_tasks"] > 1 else row["tasks"]
             interval = _range(row["low"], row["high"], ".1f")
-            table.add_row(scale, escape(row["variant"]), f"{row['iqm']:.1f}", interval, f"{row['runs']}/{row['asked']}")
+            iqm_there = f"{row['iqm']:.1f}" if row["runs"] else "-"
+            table.add_row(scale, escape(row["variant"]), iqm_there, interval, f"{row['runs']}/{row['asked']}")
         tables.append(table)
     for checkpoint, part in better.groupby("checkpoint"):
         variants = [str(variant) for variant in dict.fromkeys(part["variant"])]
@@ -396,6 +409,35 @@ def statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
             table.add_row(escape(variant), *(cells.get((variant, over), "") for over in variants))
         tables.append(table)
     return tables
+
+
+def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, better: pd.DataFrame) -> list[str]:
+    """
+    How to read :func:`score_tables` and :func:`statistics_tables`, as far as something in them has to be explained.
+
+    :param number: Table of the paper
+    :param comparison: As :func:`compare` gives it
+    :param iqm: As :func:`interquartile_means` gives them
+    :param better: As :func:`improvements` gives them
+    """
+    lines = []
+    if (iqm["runs"] < 4).any():
+        lines.append(
+            "The interquartile mean of fewer than four runs is their mean, and its interval goes from the smallest to the "
+            "largest."
+        )
+    if (better["probability"].isin([0, 1]) & (better["low"] == better["high"])).any():
+        lines.append(
+            "An interval without width says only that no run of one variant is better than any of the other: resampled runs "
+            "cannot show more. Two equal variants look like that with a probability of 1/3 (two runs each on one task), 1/10 "
+            "(three) or 1/126 (five)."
+        )
+    if comparison["paper_mean"].notna().any():
+        lines.append(
+            f"Paper: table {number}. ▲ ▼: the difference from it is more than two standard errors of the difference, "
+            "2 sqrt(s²/n + S²/N)."
+        )
+    return lines
 
 
 def as_data(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, better: pd.DataFrame, runs: pd.DataFrame) -> dict:

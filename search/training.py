@@ -78,10 +78,12 @@ class TrainingRun(NamedTuple):
 
     :param curve: Its learning curve
     :param aulc: Area under it
+    :param aux_loss: The auxiliary loss that it was trained with, "" for ``auto`` where nothing was left to train
     """
 
     curve: list[Evaluation]
     aulc: float
+    aux_loss: str = ""
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any]) -> gym.Env:
@@ -190,7 +192,7 @@ def train_candidate(
         settings["buffer_size"] = min(settings["buffer_size"], math.ceil(agent_steps / n_envs) * n_envs)
     settings |= {"aux_loss": aux_loss, "seed": seed}
 
-    store, curve = None, None
+    store, curve, trained_with = None, None, "" if aux_loss == "auto" else str(aux_loss)
     if folder is not None:
         asked_for = [environment, policy, env_kwargs, n_envs, settings, list(checkpoints), evaluation_episodes]
         store = _RunFolder(Path(folder), str(aux_loss), seed, asked_for)
@@ -217,6 +219,7 @@ def train_candidate(
 
                 if _repeat(curve, functools.partial(tell, anew=False)):
                     model = model or SACAux(policy, env, **settings)
+                    trained_with = str(model.aux_loss)
                     curve_callback = LearningCurveCallback(
                         eval_env,
                         checkpoints,
@@ -245,7 +248,7 @@ def train_candidate(
         _repeat(curve, on_evaluation)
     if store is not None:
         store.remove_checkpoint()
-    return TrainingRun(curve, aulc(curve))
+    return TrainingRun(curve, aulc(curve), trained_with)
 
 
 def train_and_keep(
@@ -313,6 +316,7 @@ def train_and_keep(
         progress_bar=True,
     )
     if not was_finished:
+        about["sessions"][-1]["aux_loss"] = run.aux_loss
         write_about(folder, {**about, "seconds": run.curve[-1].seconds})
     return run, folder, was_finished
 

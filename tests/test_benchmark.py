@@ -162,17 +162,21 @@ def test_a_file_that_says_nothing_of_a_loss_is_not_one_that_says_none(
 
 
 def test_two_sets_of_changes_are_two_commits(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    of_this_process = provenance.commit()
     (folder / "search").mkdir()
     monkeypatch.setattr(provenance, "__file__", str(folder / "search" / "provenance.py"))
     for command in ("init", "add mine.yml", "-c user.name=me -c user.email=me@here commit -m first"):
         subprocess.run(["git", *command.split()], check=True, capture_output=True)
-    commits = [provenance.commit()]
+    look = provenance.commit.__wrapped__
+    commits = [look()]
     for text in ("one", "two\xe9", "one"):
         (folder / "mine.yml").write_text(text, encoding="latin-1")
-        commits.append(provenance.commit())
+        commits.append(look())
     clean, one, two, again = commits
     assert re.fullmatch("[0-9a-f]{12}", clean) and one == again != two
     assert all(re.fullmatch(rf"{clean}\+changes\.[0-9a-f]{{8}}", commit) for commit in (one, two))
+    # A process keeps the code that it has begun with, whatever is checked out later.
+    assert provenance.provenance()["commit"] == of_this_process != again
 
 
 CHECKPOINT = 300
@@ -205,7 +209,8 @@ def test_killed_and_gone_on_with_it_is_what_it_would_have_been(folder: Path) -> 
     result = runner.invoke(app, command)
     assert result.exit_code == 0, result.stderr
 
-    cells = [Cell(variant, "Pendulum-v1", seed) for seed in (0, 1) for variant in ("mine", "plain")]
+    losses = {"mine": "{s_t, a_t} -> {s_t+1}", "plain": "None"}
+    cells = [Cell(variant, "Pendulum-v1", seed) for seed in (0, 1) for variant in losses]
     assert first.with_name("curve.csv").stat().st_mtime_ns == written  # not trained again
     means = {cell: reference(cell) for cell in cells}
     for cell in cells:
@@ -221,6 +226,7 @@ def test_killed_and_gone_on_with_it_is_what_it_would_have_been(folder: Path) -> 
         assert about["seconds"] == float(row["seconds"]) > 0
         assert {"commit", "command", "date", "cpu", "gpu", "python", "versions"} <= set(about["sessions"][-1])
         assert re.fullmatch(r"[0-9a-f]{12}(\+changes\.[0-9a-f]{8})?", about["sessions"][-1]["commit"])
+        assert about["sessions"][-1]["aux_loss"] == losses[about["variant"]]
     assert " ".join(command).removeprefix("benchmark") in json.loads(first.read_text())["sessions"][0]["command"]
 
     for variant in ("mine", "plain"):

@@ -104,7 +104,7 @@ def test_train_without_an_auxiliary_loss_into_a_folder_of_its_own(folder: Path) 
 
 
 def test_a_training_that_goes_on_names_both_its_sessions(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments: tuple[Any, ...] = ("cartpole-balance", "none", "hyper.yml", 800, 2, 1, 0, "here")
+    arguments: tuple[Any, ...] = ("cartpole-balance", None, "hyper.yml", 800, 2, 1, 0, "here")
 
     def interrupt(path: Path, about: dict[str, Any]) -> None:
         write_about(path, about)
@@ -116,7 +116,10 @@ def test_a_training_that_goes_on_names_both_its_sessions(folder: Path, monkeypat
             training.train_and_keep(*arguments)
     assert len(read_about(folder / "here")["sessions"]) == 1 and not (folder / "here" / "model.zip").exists()
     run, _, was_finished = training.train_and_keep(*arguments)
-    assert len(read_about(folder / "here")["sessions"]) == 2 and len(run.curve) == 2 and not was_finished
+    about = read_about(folder / "here")
+    assert len(about["sessions"]) == 2 and len(run.curve) == 2 and not was_finished
+    # What SACAux has chosen itself stands beside the curve too.
+    assert about["aux_loss"] == "auto" and about["sessions"][-1]["aux_loss"] == str(catalog.load("aarl-state"))
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ def test_what_the_report_says(study, tmp_path):
     assert parents and [row[1] for row in table_after(page, "Lineage of the best")] == parents
     assert table_after(page, "Baselines") == [["SAC & co", "150.0"]]
     assert table_after(page, "Settings") == [["environment", EVIL]]
-    assert table_after(page, "Where it comes from") == [["commit", "abc123"], ["cpu", "2 cores"]]
+    assert table_after(page, "What wrote this report") == [["commit", "abc123"], ["cpu", "2 cores"]]
     assert page.xpath("//h2[normalize-space()='Learning curves']")
     assert not page.xpath("//link | //iframe")
     addresses = page.xpath("//@src | //@href")
@@ -227,6 +227,16 @@ def test_machines_and_hours(study, tmp_path):
         ["CPU: 2 cores", "not noted", "14", f"{hours[0]:.2f}", f"{2 * hours[0]:.2f}"],
         ["GPU: some", "not noted", "14", f"{hours[1]:.2f}", "–"],
     ]
+
+
+def test_packages_are_those_that_the_trials_were_trained_with(tmp_path):
+    study = optuna.create_study(direction="maximize")
+    for versions in ("torch 1, numpy 2", "torch 1, numpy 2", "torch 2, numpy 2"):
+        study.add_trial(optuna.trial.create_trial(value=1.0, user_attrs={"versions": versions}))
+    write_report(study, tmp_path / "report.html", provenance={"versions": "torch 3"})
+    page = read_page(tmp_path / "report.html")
+    assert table_after(page, "Versions of packages, by trials") == [["torch 1, numpy 2", "2"], ["torch 2, numpy 2", "1"]]
+    assert table_after(page, "What wrote this report") == [["versions", "torch 3"]]
 
 
 def test_what_other_studies_of_the_storage_add(study, tmp_path):

@@ -245,6 +245,37 @@ def test_statistics_are_over_tasks_of_one_scale_that_all_variants_have(tmp_path:
     assert better.loc[("a", "b"), "n_tasks"] == 2
 
 
+def test_every_task_weighs_the_same_in_an_interquartile_mean(tmp_path: Path) -> None:
+    """Seeds that a variant has not on all tasks are left out, as rliable's matrix of runs and tasks has no gaps."""
+    rng = np.random.default_rng(0)
+    high, low = rng.normal(870.0, 5.0, 10), rng.normal(25.0, 5.0, 10)
+    scores = {("all", CHEETAH): high, ("all", WALKER): low, ("some", CHEETAH): high, ("some", WALKER): low[:3]}
+    plant_scores(tmp_path, {**scores, ("none", CHEETAH): high[:2]})
+    plant(tmp_path, Cell("none", WALKER, 5), {100_000: 1.0})  # of another seed
+    rows = table.interquartile_means(table.read_runs(tmp_path)).set_index("variant")
+    matrices = {"all": [high, low], "some": [high[:3], low[:3]]}
+    for variant, matrix in matrices.items():
+        assert rows.loc[variant, "iqm"] == pytest.approx(stats.trim_mean(np.concatenate(matrix), 0.25))
+        assert rows.loc[variant, "low"] < rows.loc[variant, "iqm"] < rows.loc[variant, "high"]
+    assert rows["runs"].to_dict() == {"all": 20, "some": 6, "none": 0}
+    assert rows["asked"].to_dict() == {"all": 20, "some": 13, "none": 3}
+    assert rows.loc["none", ["iqm", "low", "high"]].isna().all()
+    shown = runner.invoke(app, ["table", str(tmp_path)])
+    assert shown.exit_code == 0 and re.search(r"none +│ - +│ - +│ 0/3 ", shown.stdout), shown.output
+
+
+@pytest.mark.parametrize(("of_other", "says"), [([1.0, 2.0], True), ([1.0, 4.0], False), ([3.0, 5.0], False)])
+def test_intervals_without_width_are_explained(tmp_path: Path, of_other: list[float], says: bool) -> None:
+    plant_scores(tmp_path, {("mine", CHEETAH): np.array([3.0, 5.0]), ("other", CHEETAH): np.array(of_other)})
+    shown = runner.invoke(app, ["table", str(tmp_path)])
+    assert shown.exit_code == 0, shown.output
+    text = " ".join(shown.stdout.split())
+    assert ("An interval without width" in text) is says
+    for n_runs, probability in ((2, "1/3"), (3, "1/10"), (5, "1/126")):
+        together = stats.mannwhitneyu(range(n_runs), range(n_runs, 2 * n_runs), method="exact").pvalue
+        assert together == pytest.approx(eval(probability)) and (probability in text) is says
+
+
 def test_one_run_has_neither_deviation_nor_interval_nor_mark(tmp_path: Path) -> None:
     plant_scores(tmp_path, {("aarl_state", CHEETAH): np.array([1.0]), ("sac_identity", CHEETAH): np.array([999.0])})
     runs = table.read_runs(tmp_path)
