@@ -1,5 +1,5 @@
 """
-Write README.md from the runs that lie beside it: every number in it comes from a curve.csv and its provenance.json.
+Write README.md from the runs that lie beside it: every number of a run of ours comes from a curve.csv and its provenance.json.
 
 A folder here is what ``aarl benchmark`` leaves, without its storage and the checkpoints of unfinished runs. What is said of it
 stands in its about.md, the first line being its title; numbers do not belong there.
@@ -20,18 +20,18 @@ from search.table import closest_table, paper_scores
 
 RESULTS = Path(__file__).parent
 ABOUT = "about.md"
-# A search from states as this project measures it, seven stages of a hundred candidates and the environment steps of each on
-# Cheetah-Run; and the GPU hours after which the paper stopped each of its own, whose candidates it does not count.
+# The paper's search from states: seven stages on Cheetah-Run (table 12) of a population of 100 (section 2.2; ours adds 25 of
+# the priors), the environment steps of a candidate there, and the GPU hours after which the paper stopped each of its own.
 CANDIDATES, STEPS, PAPER_HOURS = 700, 500_000, 1_500
 # What the public code gave on this software stack, in float32 with one seed: measured when this project was planned; there are
 # no curves of it here.
-REFERENCE = {("dm_control/cheetah-run-v0", 100_000): "AARL-State 436, SAC with DenseMLP 274"}
+REFERENCE = {("dm_control/cheetah-run-v0", 100_000): "AARL-State 436, SAC with DenseMLP 274 (seed 1, float32)"}
 # The paper's scores from pixels and from states.
 TABLES = {"CnnPolicy": 3, "MlpPolicy": 4}
 
 INTRODUCTION = f"""# Results
 
-Written by `python results/{Path(__file__).name}`: no number here is typed by hand. Each run's learning curve is
+Written by `python results/{Path(__file__).name}`: no number of a run of ours is typed by hand. Each run's learning curve is
 `FOLDER/VARIANT/TASK/seed-N/curve.csv` (returns of deterministic episodes at environment steps), all that is needed to
 make it again is in the `provenance.json` beside it. Benchmarks of speed and of the search are in
 [benchmarks](../benchmarks/README.md).
@@ -91,7 +91,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
             sessions[-1]["date"][:10],
         ]
         yield f"| {' | '.join(cells)} |"
-    yield "\nMade by, and made again by (`--out` another folder):\n"
+    yield "\nMade again by (`--out` another folder, `--workers` for several at once):\n"
     yield "```bash"
     yield from commands(about for _, about in finished)
     yield "```\n"
@@ -145,11 +145,12 @@ def commands(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
     """
     seeds: dict[tuple[str, str], list[int]] = {}
     for about in abouts:
-        steps = about["evaluations"]
-        between = sorted(set(steps) - set(about["checkpoints"]))
+        steps, checkpoints = about["evaluations"], about["checkpoints"]
+        # The interval between checkpoints: the one that gives these evaluations.
+        every = [step for step in steps if sorted({*checkpoints, *range(step, steps[-1], step)}) == steps]
         before = ["aarl", "benchmark", about["file"], "--envs", task_name(about["environment"])]
-        after = ["--checkpoints", ",".join(map(str, about["checkpoints"]))]
-        after += ["--every", str(between[0])] if between else []
+        after = ["--checkpoints", ",".join(map(str, checkpoints))]
+        after += ["--every", str(every[0])] if steps != checkpoints else []
         after += ["--episodes", str(about["evaluation_episodes"]), "--threads", str(about["sessions"][-1]["threads"])]
         seeds.setdefault((shlex.join(before), shlex.join(after)), []).append(about["seed"])
     for (variant, settings), numbers in seeds.items():

@@ -73,6 +73,21 @@ def test_readme_of_planted_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert sorted(asked, key=str) == sorted((grid.about(cell) for cell in grid.cells), key=str)
 
 
+@pytest.mark.parametrize(
+    ("checkpoints", "every"),
+    [([100_000], 20_000), ([100_000], 30_000), ([20_000, 100_000], 20_000), ([40_000, 100_000], None)],
+)
+def test_commands_have_the_interval(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkpoints: list[int], every: int | None
+) -> None:
+    monkeypatch.chdir(RESULTS.parent)
+    grid = load_benchmark([Path("zoo_configs/aarl_state.yml")], ["cheetah-run"], [0, 2], checkpoints, every)
+    abouts = [{**grid.about(cell), "sessions": [SESSION]} for cell in grid.cells]
+    (command,) = make_readme["commands"](abouts)
+    assert "--seeds 0,2" in command and ("--every" in command) is (every is not None)
+    assert asked_for(tmp_path, command, monkeypatch) == [grid.about(cell) for cell in grid.cells]
+
+
 def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = make_readme["readme"](RESULTS)
     assert (RESULTS / "README.md").read_text(encoding="utf-8") == text, "python results/make_readme.py"
