@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import FrameStackObservation
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
@@ -40,6 +41,14 @@ def _equal(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two arrays are the same; NaN is NaN, so that one in an observation does not look like a new episode."""
     # The plain comparison is much faster, and mostly enough.
     return bool((one == other).all()) or np.array_equal(one, other, equal_nan=True)
+
+
+def _first_stack(frames: np.ndarray) -> str | None:
+    """How a stack begins an episode: with its one frame "repeated", or with "zeros" before it; None if it does not."""
+    before = frames[:-1]
+    if _equal(before, np.broadcast_to(frames[-1], before.shape)):
+        return "repeated"
+    return None if before.any() else "zeros"
 
 
 # Memory that drawn observations had, and that others may have after them: pieces and bytes in all, at most.
@@ -407,9 +416,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         action = np.asarray(action).reshape(self.n_envs, self.action_dim)
         reward = np.asarray(reward).reshape(self.n_envs)
         done = np.array(done, bool).reshape(self.n_envs)  # a copy: it is looked at again with the next transition
-        starts = self._episode_over.copy()
-        for key, last in self._last_next_obs.items():
-            starts |= [not _equal(*pair) for pair in zip(current[key], last, strict=True)]
+        starts = self._starts(current)
         zero_padded = self._check_stacks(current, following, starts, done)
 
         pos, row = self.pos, self.n_added
@@ -446,6 +453,28 @@ class WindowReplayBuffer(NStepReplayBuffer):
             self.full = True
             self.pos = 0
 
+    def can_go_on(self, obs: np.ndarray | dict[str, np.ndarray]) -> bool:
+        """
+        Whether a transition from these observations can be added: each is what the last transition led to, or begins an
+        episode. A buffer that was emptied or exchanged inside an episode has not the earlier frames of a stack.
+
+        :param obs: Observations of all envs
+        """
+        current = self._by_key(obs)
+        starts = self._starts(current)
+        return all(
+            _first_stack(store.split(current[key])[env]) is not None
+            for key, store in self.stores.items()
+            for env in np.flatnonzero(starts)
+        )
+
+    def _starts(self, current: dict[str, np.ndarray]) -> np.ndarray:
+        """Which envs begin an episode with these observations."""
+        starts = self._episode_over.copy()
+        for key, last in self._last_next_obs.items():
+            starts |= [not _equal(*pair) for pair in zip(current[key], last, strict=True)]
+        return starts
+
     def _by_key(self, obs: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         parts = obs if isinstance(obs, dict) else {"": obs}
         return {key: np.asarray(parts[key]).reshape(self.n_envs, *store.shape) for key, store in self.stores.items()}
@@ -469,10 +498,11 @@ class WindowReplayBuffer(NStepReplayBuffer):
                 continue
             old, new = store.split(current[key]), store.split(following[key])
             for env in range(self.n_envs):
-                if starts[env] and not _equal(old[env, :-1], np.broadcast_to(old[env, -1], old[env, :-1].shape)):
-                    if old[env, :-1].any():
+                if starts[env]:
+                    first = _first_stack(old[env])
+                    if first is None:
                         raise self._stack_error(key, env, "an episode begins neither with one frame repeated nor with zeros")
-                    zero_padded[key][env] = True
+                    zero_padded[key][env] = first == "zeros"
                 # VecNormalize gives an episode's last observation back with rounding errors; images are floats then.
                 rounded = done[env] and (np.issubdtype(store.dtype, np.floating) or len(store.shape) == 1)
                 if not rounded and not _equal(new[env, :-1], old[env, 1:]):
@@ -610,7 +640,7 @@ def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
         stack = outer.stacked_obs.n_stack
         inner = getattr(outer.stacked_obs, "sub_stacked_observations", {"": outer.stacked_obs})
     else:
-        stack = int(env.get_attr("stack_size")[0]) if env.has_attr("stack_size") else 1
+        stack = env.get_attr("stack_size")[0] if all(env.env_is_wrapped(FrameStackObservation)) else 1
     stacks: dict[str, int] = {}
     for key, part in parts.items():
         shape = part.shape or (1,)

@@ -50,7 +50,7 @@ class _CropsImages:
             if self.crop_size is not None:
                 images = center_crop(images, self.crop_size)
             if not self.normalize_images:
-                return images
+                return images.contiguous()  # an encoder may look at its input as one row, as PyTorch's own examples do
             if images.dtype.is_floating_point:
                 return images.float() / 255
             # Scaled in place, in the layout that the encoder's convolutions want: images are the largest tensors there are.

@@ -45,6 +45,13 @@ class NonFiniteError(FloatingPointError, ValueError):
     """An observation, reward, loss or parameter is NaN or infinite; the message says which and when."""
 
 
+class ParametersError(RuntimeError, ValueError):
+    """
+    Parameters are of a model with other settings. SB3's ``set_parameters`` raises ValueError there, which its ``load`` takes
+    for a DQN of an old version unless it is a RuntimeError too.
+    """
+
+
 class ExplodedError(FloatingPointError):
     """Q values are far larger than rewards allow; the message says how large they are, may be, and when."""
 
@@ -103,10 +110,11 @@ class SACAux(SAC):
     :param aux_batch_size: Windows for each auxiliary update, None for ``batch_size``
     :param encoder_tau: Polyak coefficient of the momentum encoder
     :param encoder_learning_rate: Of the auxiliary loss's optimizer, may be a schedule; None for ``learning_rate``
-        (3e-3 for some pixel tasks)
+        (3e-3 for some pixel tasks). Without an auxiliary loss there is no such optimizer: the critic's trains the encoder
     :param joint_optimizer: False (default, CURL and the reference): the auxiliary loss has an optimizer of its own for
-        encoder and predictor, beside the critic's, which trains the encoder too. True (equation 1): one optimizer
-        trains the encoder on the sum of both losses, at ``encoder_learning_rate``
+        encoder and predictor, beside the critic's, which trains the encoder too (weight decay, if ``optimizer_kwargs`` has
+        one, then reaches the encoder from both). True (equation 1): one optimizer trains the encoder on the sum of both
+        losses, at ``encoder_learning_rate``
     :param predictor_width: Hidden units of the predictor (256), None for twice its input (the reference)
     :param predictor_batch_norm: Whether the predictor has batch norm (the paper names none, the reference has it)
     :param policy_delay: Gradient steps between updates of actor and entropy coefficient (2: CURL, the reference)
@@ -241,6 +249,7 @@ class SACAux(SAC):
         self.aux_optimizer: th.optim.Optimizer | None = None
         self._n_aux_skipped = 0
         self._largest_reward = 0.0
+        self._first_error = 0.0
         self._random_state: dict[str, Any] | None = None
 
         if _init_setup_model:
@@ -272,10 +281,11 @@ class SACAux(SAC):
             # SB3 warns that a buffer class of the user's own goes without n_steps; this one does not.
             self.replay_buffer_class = None
             self.replay_buffer = self.replay_buffer or self._make_replay_buffer()
-        policy_kwargs, random_state = self.policy_kwargs, self._random_state
+        policy_kwargs, buffer_kwargs, random_state = self.policy_kwargs, self.replay_buffer_kwargs, self._random_state
         self.policy_kwargs = {"augmentation": self.augmentation, "crop_size": self.crop_size, **policy_kwargs}
+        self.replay_buffer_kwargs = dict(buffer_kwargs)  # SB3 adds n_steps and gamma, which load() may be given anew
         super()._setup_model()
-        self.policy_kwargs, self._random_state = policy_kwargs, random_state
+        self.policy_kwargs, self.replay_buffer_kwargs, self._random_state = policy_kwargs, buffer_kwargs, random_state
         if own_buffer:
             self.replay_buffer_class = WindowReplayBuffer
 
@@ -330,7 +340,7 @@ class SACAux(SAC):
         assert self.n_steps == 1 or not isinstance(self.observation_space, spaces.Dict), (
             f"n_steps={self.n_steps}: n-step returns are not supported for Dict observation spaces"
         )
-        if self.env is not None:
+        if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
             self._frame_stack = detect_frame_stack(self.env)
         found = {} if self._frame_stack is None else {"frame_stack": self._frame_stack}
         n_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
@@ -435,10 +445,13 @@ class SACAux(SAC):
         """
         if self.gamma >= 1:
             return
-        # Where rewards are tiny, or none came yet, the networks begin with values of about 1 nevertheless.
+        if steps[0] == 1:
+            self._first_error = max(self._first_error, float(values[0]))
+        # Where rewards are tiny, or none came yet, the networks begin with values of about 1 nevertheless, and with large ones
+        # where an encoder passes on large observations.
         assert isinstance(self.action_space, spaces.Box)
         entropy = ent_coef * LARGEST_LOG_DENSITY * float(np.prod(self.action_space.shape))
-        bound = (max(1.0, self._largest_reward) + entropy) / (1 - self.gamma)
+        bound = max((max(1.0, self._largest_reward) + entropy) / (1 - self.gamma), self._first_error)
         worst = int(np.argmax(values))
         if values[worst] > EXPLODED * bound:
             raise ExplodedError(
@@ -563,9 +576,11 @@ class SACAux(SAC):
                 min_q = self.critic.min_q_values(latent, actions_pi, skip_rows=self.aux_head is not None)
             actor_loss = (ent_coef * log_prob - min_q).mean()
             log("actor_loss", actor_loss)
-            self.actor.optimizer.zero_grad()
-            actor_loss.backward(inputs=[parameter for parameter in self.actor.own_parameters() if parameter.requires_grad])
-            self.actor.optimizer.step()
+            trained = [parameter for parameter in self.actor.own_parameters() if parameter.requires_grad]
+            if trained:
+                self.actor.optimizer.zero_grad()
+                actor_loss.backward(inputs=trained)
+                self.actor.optimizer.step()
 
         # Target critic, its encoder being the momentum encoder.
         if update_target:
@@ -652,7 +667,28 @@ class SACAux(SAC):
                     f"{self.num_timesteps} (index {where})"
                 )
 
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        As in SB3.
+
+        :param path: Path of the pickled replay buffer
+        :param truncate_last_traj: As in SB3, of HerReplayBuffer
+        :raises ValueError: when the auxiliary loss needs windows, and the buffer gives none; the model keeps its own then
+        """
+        before = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        if self.aux_head is not None and not isinstance(self.replay_buffer, WindowReplayBuffer):
+            loaded, self.replay_buffer = self.replay_buffer, before
+            raise ValueError(
+                f"a {type(loaded).__name__} gives no windows, which aux_loss={self.aux_loss} needs: {path} was not saved by a "
+                "model with sb3_aarl.buffers.WindowReplayBuffer"
+            )
+
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs  # type: ignore[has-type]
+        if obs is not None and isinstance(self.replay_buffer, WindowReplayBuffer) and not self.replay_buffer.can_go_on(obs):
+            logger.warning("the replay buffer has no frames of the running episodes: the environments are reset")
+            self._last_obs = None
         result = super()._setup_learn(*args, **kwargs)
         self._check_finite("observation", self._last_obs)  # type: ignore[arg-type]
         return result
@@ -727,20 +763,24 @@ class SACAux(SAC):
         culprit = self._non_finite_parameter()
         if culprit is not None:
             raise NonFiniteError(f"{culprit} is not finite: the model is not saved to {path}")
-        self._random_state = self._get_random_state()
+        # That of a loaded model which has not gone on yet: generators have been seeded anew meanwhile.
+        pending = self._random_state
+        self._random_state = pending or self._get_random_state()
         try:
             super().save(path, exclude, include)
         finally:
-            self._random_state = None
+            self._random_state = pending
 
     def _non_finite_parameter(self) -> str | None:
-        """The name of a parameter that is NaN or infinite, if there is one."""
-        variables = {name: getattr(self, name) for name in self._get_torch_save_params()[1]}
-        for name, parameters in {**self.get_parameters(), "model": variables}.items():
-            for key, value in parameters.items():
-                if isinstance(value, th.Tensor) and not th.isfinite(value).all():
-                    return f"{name}.{key}"
-        return None
+        """The name of a parameter, or of a running mean of batch norm, that is NaN or infinite, if there is one."""
+        found = [(f"model.{name}", getattr(self, name)) for name in self._get_torch_save_params()[1]]
+        for name, module in (("policy", self.policy), ("aux_head", self.aux_head)):
+            if module is not None:
+                # Other buffers are an encoder's own affair: a mask may well be infinite.
+                ends = ("running_mean", "running_var")
+                means = {key: buffer for key, buffer in module.named_buffers() if key.endswith(ends)}
+                found += [(f"{name}.{key}", value) for key, value in {**dict(module.named_parameters()), **means}.items()]
+        return next((name for name, value in found if value is not None and not th.isfinite(value).all()), None)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "ent_coef_schedule", "encoder_schedule", "_graphed_step"]
@@ -754,17 +794,20 @@ class SACAux(SAC):
         :param load_path_or_dict: Path of a saved model, or what ``get_parameters`` gave
         :param exact_match: Whether all parameters must be there, and no others
         :param device: Device of the parameters
-        :raises RuntimeError: when they hold an auxiliary loss and this model has none
+        :raises ParametersError: when they are of a model with other settings
         """
         if not isinstance(load_path_or_dict, dict):
             load_path_or_dict = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
         if ("aux_head" in load_path_or_dict) > (self.aux_head is not None):
-            # Not a ValueError, which SB3's load() takes for a DQN of an old version.
-            raise RuntimeError(
+            raise ParametersError(
                 "these parameters are of a model with an auxiliary loss, this one has none: load it with its own, and make a "
                 "new model with aux_loss=None to train without"
             )
-        super().set_parameters(load_path_or_dict, exact_match, device)  # type: ignore[arg-type]
+        try:
+            super().set_parameters(load_path_or_dict, exact_match, device)  # type: ignore[arg-type]
+        except ValueError as error:
+            settings = f"aux_loss={self.aux_loss} and joint_optimizer={self.joint_optimizer}"
+            raise ParametersError(f"{error}. Are they of a model with other settings than {settings}?") from error
         if self._graphed_step is not None:
             # What was recorded reads and writes the tensors that the optimizers had before.
             self._graphed_step = GraphedStep(self._gradient_step, self.device)

@@ -624,6 +624,14 @@ def vector_env() -> gym.Env:
     return FlattenObservation(FrameStackObservation(Shown(VECTOR), 3))
 
 
+class Labelled(gym.Wrapper):
+    """Has an attribute of the name that Gymnasium's wrapper uses, for something else."""
+
+    def __init__(self, env: gym.Env, stack_size: Any):
+        super().__init__(env)
+        self.stack_size = stack_size
+
+
 TABLE = spaces.Box(-1, 1, (4, 5), np.float32)
 BOTH = spaces.Dict({"image": IMAGE, "state": VECTOR, "table": TABLE})
 
@@ -655,6 +663,8 @@ BOTH = spaces.Dict({"image": IMAGE, "state": VECTOR, "table": TABLE})
         ),
         (lambda: DummyVecEnv([lambda: Shown(BOTH)]), {"image": 1, "state": 1, "table": 1}),
         # What is taken out has no key any more.
+        (lambda: DummyVecEnv([lambda: Labelled(Shown(VECTOR), 3)]), 1),
+        (lambda: DummyVecEnv([lambda: Labelled(Shown(VECTOR), None)]), 1),
         (lambda: VecExtractDictObs(VecFrameStack(DummyVecEnv([lambda: Shown(BOTH)]), 2), "state"), 1),
     ],
 )

@@ -134,6 +134,20 @@ def test_healthy_trainings_stay_far_below_the_limit(make: Callable[[], Any], mon
     assert model._n_updates == 80
 
 
+@pytest.mark.parametrize("gamma", [0.0, 0.9, 0.99])
+def test_large_observations_are_no_divergence(gamma: float) -> None:
+    """Raw observations of another unit give large Q values from the beginning on; SB3's SAC trains with them."""
+    space = gym.spaces.Box(-1e7, 1e7, (2,), np.float32)
+    env = gym.wrappers.TransformObservation(Rewarding(0.5), lambda obs: 1e7 * obs, space)
+    settings = {**NETS, "policy_kwargs": {"net_arch": [16], "features_extractor_class": "identity"}}
+    model = SACAux("MlpPolicy", env, aux_loss=None, gamma=gamma, seed=0, **settings)
+    model.learn(60)
+    assert model._n_updates == 40
+    # What is far beyond these is one.
+    with pytest.raises(ExplodedError, match=r"^c is "):
+        model._check_q_values("c", np.array([1e12]), [41], 0.0)
+
+
 @pytest.mark.parametrize("gamma", [0.9, 0.99])
 @pytest.mark.parametrize(("reward", "ent_coef"), [(0.0, 0.0), (-50.0, 0.0), (3.0, 2.0)])
 def test_the_limit(gamma: float, reward: float, ent_coef: float) -> None:

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from sb3_aarl import SACAux, catalog
 from sb3_aarl.augmentation import center_crop
 from sb3_aarl.buffers import WindowSamples
-from sb3_aarl.sac_aux import NonFiniteError
+from sb3_aarl.sac_aux import NonFiniteError, ParametersError
 
 LOSS = "{s_t, a_t, r_t} -> {r_t+1, s_t+1, s_t+2}"
 KINDS = ("state", "pixels", "dict")
@@ -775,6 +775,135 @@ def test_a_model_with_nan_is_not_saved_over_a_good_one(tmp_path: pathlib.Path) -
     assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
     model.save(tmp_path / "model.zip")
     assert_same(everything(SACAux.load(tmp_path / "model.zip", device="cpu")), everything(model))
+
+
+class Masked(FlattenExtractor):
+    """An encoder with a buffer that is infinite on purpose, and the layer that the auxiliary loss trains."""
+
+    def __init__(self, observation_space: spaces.Box):
+        super().__init__(observation_space)
+        self.layer = th.nn.Linear(3, 3)
+        self.norm = th.nn.BatchNorm1d(3)
+        self.register_buffer("mask", th.full((3,), -math.inf))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.norm(self.layer(observations)).maximum(self.mask)
+
+
+def test_an_infinite_buffer_is_not_a_divergence(tmp_path: pathlib.Path) -> None:
+    policy_kwargs = {"features_extractor_class": Masked, "features_extractor_kwargs": {}}
+    model = make_model(policy_kwargs=policy_kwargs).learn(30)
+    model.save(tmp_path / "model")
+    assert_same(everything(SACAux.load(tmp_path / "model", device="cpu")), everything(model))
+
+    class Broken(BaseCallback):
+        def _on_step(self) -> bool:
+            raise ValueError("my callback is wrong")
+
+    with pytest.raises(ValueError, match=r"^my callback is wrong$"):
+        model.learn(5, Broken())
+    # What is averaged while it learns is watched all the same.
+    model.critic.features_extractor.norm.running_var[1] = math.inf
+    with pytest.raises(NonFiniteError, match="running_var is not finite"):
+        model.save(tmp_path / "other")
+
+
+def test_saving_a_loaded_model_changes_nothing(tmp_path: pathlib.Path) -> None:
+    model = make_model().learn(40)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    env = model.get_env()
+
+    def resumed(path: str, backup: str | None = None) -> dict[str, Any]:
+        loaded = SACAux.load(tmp_path / path, env=copy.deepcopy(env), force_reset=False, device="cpu")
+        loaded.load_replay_buffer(tmp_path / "buffer")
+        if backup is not None:
+            loaded.save(tmp_path / backup)
+        return everything(loaded.learn(40, reset_num_timesteps=False))
+
+    straight = resumed("model")
+    assert_same(resumed("model", backup="backup"), straight)
+    assert_same(resumed("backup"), straight)
+
+
+def test_loading_with_other_settings_says_what_is_wrong(tmp_path: pathlib.Path) -> None:
+    make_model(aux_loss=None).save(tmp_path / "plain")
+    make_model().save(tmp_path / "model")
+    for path, settings in (("plain", {"aux_loss": LOSS}), ("model", {"joint_optimizer": True})):
+        with pytest.raises(ParametersError, match=r"Are they of a model with other settings than aux_loss=.*joint_optimizer="):
+            SACAux.load(tmp_path / path, **settings)
+
+
+def test_loading_with_other_n_step_returns(tmp_path: pathlib.Path) -> None:
+    model = make_model(n_steps=3)
+    assert model.replay_buffer_kwargs == {} and model.replay_buffer.n_steps == 3
+    model.save(tmp_path / "model")
+    loaded = SACAux.load(tmp_path / "model", make_env("state"), n_steps=2, gamma=0.5)
+    assert (loaded.replay_buffer.n_steps, loaded.replay_buffer.gamma) == (2, 0.5)
+    assert SACAux.load(tmp_path / "model", make_env("state"), n_steps=1).replay_buffer.n_steps == 1
+
+
+def test_a_replay_buffer_without_windows_is_not_loaded(tmp_path: pathlib.Path) -> None:
+    theirs = SAC("MlpPolicy", make_env("state"), learning_starts=100, buffer_size=50).learn(20)
+    theirs.save_replay_buffer(tmp_path / "buffer")
+    model = make_model().learn(30)
+    buffer = model.replay_buffer
+    with pytest.raises(ValueError, match=r"a ReplayBuffer gives no windows, which aux_loss=\{s_t.*buffer was not saved by"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is buffer
+    plain = make_model(aux_loss=None)
+    plain.load_replay_buffer(tmp_path / "buffer")
+    assert plain.learn(30)._n_updates > 0
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_buffer_that_was_emptied_inside_an_episode(n_envs: int, caplog: pytest.LogCaptureFixture) -> None:
+    model = make_model("pixels", VecFrameStack(make_env("pixels", n_envs, length=50), 3, channels_order="first"))
+    model.learn(20)
+    model.learn(4, reset_num_timesteps=False)
+    assert not caplog.records  # it goes on inside the episode
+    model.replay_buffer.reset()
+    model.learn(20, reset_num_timesteps=False)
+    assert ["the environments are reset" in record.message for record in caplog.records] == [True]
+    assert model.replay_buffer.size() == 20 // n_envs
+
+
+class Viewed(BaseFeaturesExtractor):
+    """Looks at images as rows, which only memory without gaps allows."""
+
+    def __init__(self, observation_space: spaces.Box):
+        super().__init__(observation_space, features_dim=4)
+        self.layer = th.nn.Linear(3 * 16 * 16, 4)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.layer(observations.view(len(observations), -1))
+
+
+def test_cropped_floats_reach_an_encoder_without_gaps() -> None:
+    env = gym.wrappers.TransformObservation(
+        Point("pixels"), lambda image: (image / 255).astype(np.float32), spaces.Box(0, 1, (3, 18, 20), np.float32)
+    )
+    policy_kwargs = {"features_extractor_class": Viewed, "features_extractor_kwargs": {}, "normalize_images": False}
+    model = make_model("pixels", env, policy_kwargs, augmentation="random_crop").learn(30)
+    image = env.reset(seed=1)[0]
+    action, _ = model.predict(image, deterministic=True)
+    # The centre is what counts.
+    framed = np.zeros_like(image)
+    framed[:, 1:-1, 2:-2] = image[:, 1:-1, 2:-2]
+    assert not np.array_equal(framed, image) and np.array_equal(model.predict(framed, deterministic=True)[0], action)
+
+
+def test_an_actor_that_is_frozen_stays_as_it_is() -> None:
+    model = make_model(ent_coef=0.1)
+    for parameter in model.actor.own_parameters():
+        parameter.requires_grad = False
+    own = {id(parameter) for parameter in model.actor.own_parameters()}
+    frozen = {name for name, parameter in model.policy.named_parameters() if id(parameter) in own}
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.learn(40)
+    moved = {name for name, value in model.policy.state_dict().items() if not th.equal(before[name], value)}
+    assert frozen and not moved & frozen
+    assert moved >= {name for name in before if name.startswith("critic.") and name.endswith("weight")}
 
 
 # --- Seeds and prediction ----------------------------------------------------------------------------------------------
