@@ -6,6 +6,8 @@ RL-Zoo's own programs with SACAux, as ``sac_aux``, and with DeepMind Control as 
     python -m sb3_aarl.rl_zoo record_video --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
     python -m sb3_aarl.rl_zoo plot_train -a sac_aux -e dm_control/cheetah-run-v0 -f logs
 
+``train -optimize`` samples what RL-Zoo samples for SAC, and ``policy_kwargs`` are RL-Zoo's own then, not the file's.
+
 Everything after the program's name is RL-Zoo's: see ``python -m sb3_aarl.rl_zoo train --help``.
 """
 
@@ -39,9 +41,12 @@ def register() -> None:
     :raises ModuleNotFoundError: without RL-Zoo
     """
     from rl_zoo3 import ALGOS  # type: ignore[import-not-found]
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER  # type: ignore[import-not-found]
 
-    # The one dictionary that all of RL-Zoo's modules have imported.
+    # The one dictionary of each kind that all of RL-Zoo's modules have imported.
     ALGOS["sac_aux"] = SACAux
+    HYPERPARAMS_SAMPLER["sac_aux"] = HYPERPARAMS_SAMPLER["sac"]
+    HYPERPARAMS_CONVERTER["sac_aux"] = HYPERPARAMS_CONVERTER["sac"]
     for env_id in env_ids():
         # RL-Zoo makes environments with this method of their specification.
         gym.registry[env_id].make = functools.partial(_make_env, env_id)  # type: ignore[method-assign]

@@ -52,7 +52,7 @@ class ParametersError(RuntimeError, ValueError):
     """
 
 
-class ExplodedError(FloatingPointError):
+class ExplodedError(FloatingPointError, ValueError):
     """Q values are far larger than rewards allow; the message says how large they are, may be, and when."""
 
 
@@ -711,7 +711,7 @@ class SACAux(SAC):
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         except ValueError as error:
             # PyTorch refuses actions that are NaN before any loss is; it knows neither the step nor the cause.
-            culprit = None if isinstance(error, NonFiniteError) else self._non_finite_parameter()
+            culprit = None if isinstance(error, FloatingPointError) else self._non_finite_parameter()
             if culprit is None:
                 raise
             raise NonFiniteError(f"{culprit} is not finite at {self._step_and_loss(self._n_updates)}") from error

@@ -7,6 +7,7 @@ from ast import literal_eval
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from stable_baselines3.common.monitor import load_results
 
@@ -91,6 +92,17 @@ def added(arguments: list[str]) -> dict[str, object]:
     """What is behind the last --env-kwargs, as RL-Zoo reads it: values are Python, the last of a key counts."""
     values = arguments[len(arguments) - arguments[::-1].index("--env-kwargs") :]
     return {key: literal_eval(value) for key, _, value in (item.partition(":") for item in values)}
+
+
+def test_optimizes_what_rl_zoo_optimizes_of_sac(tmp_path: Path) -> None:
+    pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
+    trials = ["-optimize", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1", "--sampler", "random"]
+    settings = ["-n", "280", "--eval-episodes", "1", "--device", "cpu", "--seed", "3", "-params", "learning_starts:260"]
+    run(tmp_path, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "aarl_state.yml"), *trials, *settings)
+    (report,) = (tmp_path / "logs" / "sac_aux").glob("report_*.csv")
+    rows = pd.read_csv(report)
+    assert list(rows["state"]) == ["COMPLETE"] * 2 and rows["value"].notna().all()
+    assert {"params_learning_rate", "params_tau", "params_net_arch", "params_one_minus_gamma"} <= set(rows)
 
 
 def test_environment_arguments_of_the_file() -> None:
