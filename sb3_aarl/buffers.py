@@ -453,10 +453,15 @@ class WindowReplayBuffer(NStepReplayBuffer):
             self.full = True
             self.pos = 0
 
+    @property
+    def stacks(self) -> bool:
+        """Whether any observation is a stack of frames."""
+        return any(store.stack > 1 for store in self.stores.values())
+
     def can_go_on(self, obs: np.ndarray | dict[str, np.ndarray]) -> bool:
         """
-        Whether a transition from these observations can be added: each is what the last transition led to, or begins an
-        episode. A buffer that was emptied or exchanged inside an episode has not the earlier frames of a stack.
+        Whether the frames of these observations are known: each is what the last transition led to, or begins an episode. A
+        buffer that was emptied or exchanged inside an episode has not the earlier frames of a stack.
 
         :param obs: Observations of all envs
         """
@@ -515,7 +520,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
             f"frame_stack={store.stack} does not fit observations{f' under {key!r}' if key else ''} of shape {store.shape} "
             f"(env {env}, transition {self.n_added}): {problem}. The stack has to be the outermost observation wrapper, along "
             "the channels, oldest frame first: action repeat, rendering and resizing inside, FrameStackObservation or "
-            "VecFrameStack outside. If observations are no stacks, pass replay_buffer_kwargs=dict(frame_stack=1)"
+            "VecFrameStack outside. If observations are no stacks, pass replay_buffer_kwargs=dict(frame_stack=1); if the "
+            "buffer was emptied inside an episode, reset the environments too"
         )
 
     def sample(  # type: ignore[override]
@@ -641,6 +647,7 @@ def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
         inner = getattr(outer.stacked_obs, "sub_stacked_observations", {"": outer.stacked_obs})
     else:
         stack = env.get_attr("stack_size")[0] if all(env.env_is_wrapped(FrameStackObservation)) else 1
+        stack = stack if isinstance(stack, int) and stack > 0 else 1  # of a wrapper outside of it
     stacks: dict[str, int] = {}
     for key, part in parts.items():
         shape = part.shape or (1,)

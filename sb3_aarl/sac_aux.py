@@ -13,10 +13,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, RolloutReturn, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update
 from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
@@ -340,7 +341,7 @@ class SACAux(SAC):
         assert self.n_steps == 1 or not isinstance(self.observation_space, spaces.Dict), (
             f"n_steps={self.n_steps}: n-step returns are not supported for Dict observation spaces"
         )
-        if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
+        if self.env is not None:
             self._frame_stack = detect_frame_stack(self.env)
         found = {} if self._frame_stack is None else {"frame_stack": self._frame_stack}
         n_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
@@ -684,14 +685,30 @@ class SACAux(SAC):
                 "model with sb3_aarl.buffers.WindowReplayBuffer"
             )
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs  # type: ignore[has-type]
-        if obs is not None and isinstance(self.replay_buffer, WindowReplayBuffer) and not self.replay_buffer.can_go_on(obs):
-            logger.warning("the replay buffer has no frames of the running episodes: the environments are reset")
-            self._last_obs = None
-        result = super()._setup_learn(*args, **kwargs)
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        buffer = self.replay_buffer
+        if isinstance(buffer, WindowReplayBuffer) and self._last_obs is not None and not reset_num_timesteps:  # type: ignore[has-type]
+            obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs  # type: ignore[has-type]
+            if obs is not None and not buffer.can_go_on(obs):
+                logger.warning("the replay buffer has no frames of the running episodes: the environments are reset")
+                self._last_obs = None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_finite("observation", self._last_obs)  # type: ignore[arg-type]
         return result
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        rollout = super().collect_rollouts(*args, **kwargs)
+        if not rollout.continue_training and isinstance(self.replay_buffer, WindowReplayBuffer) and self.replay_buffer.stacks:
+            # A callback stopped it before the last step was stored: that frame is missing in the stacks that would follow.
+            self._last_obs = None
+        return rollout
 
     def learn(
         self: SelfSACAux,
@@ -772,14 +789,15 @@ class SACAux(SAC):
             self._random_state = pending
 
     def _non_finite_parameter(self) -> str | None:
-        """The name of a parameter, or of a running mean of batch norm, that is NaN or infinite, if there is one."""
+        """The name of a parameter or buffer that is NaN, or infinite where that is wrong, if there is one."""
         found = [(f"model.{name}", getattr(self, name)) for name in self._get_torch_save_params()[1]]
         for name, module in (("policy", self.policy), ("aux_head", self.aux_head)):
             if module is not None:
-                # Other buffers are an encoder's own affair: a mask may well be infinite.
-                ends = ("running_mean", "running_var")
-                means = {key: buffer for key, buffer in module.named_buffers() if key.endswith(ends)}
-                found += [(f"{name}.{key}", value) for key, value in {**dict(module.named_parameters()), **means}.items()]
+                found += [(f"{name}.{key}", parameter) for key, parameter in module.named_parameters()]
+                for key, buffer in module.named_buffers():
+                    # A mask of an encoder may well be infinite, a mean of batch norm may not.
+                    is_mean = key.endswith(("running_mean", "running_var"))
+                    found.append((f"{name}.{key}", buffer if is_mean else buffer.masked_fill(buffer.isinf(), 0)))
         return next((name for name, value in found if value is not None and not th.isfinite(value).all()), None)
 
     def _excluded_save_params(self) -> list[str]:
@@ -805,8 +823,9 @@ class SACAux(SAC):
             )
         try:
             super().set_parameters(load_path_or_dict, exact_match, device)  # type: ignore[arg-type]
-        except ValueError as error:
-            settings = f"aux_loss={self.aux_loss} and joint_optimizer={self.joint_optimizer}"
+        except (ValueError, RuntimeError) as error:
+            names = ("aux_loss", "joint_optimizer", "predictor_width", "predictor_batch_norm")
+            settings = ", ".join(f"{name}={getattr(self, name)}" for name in names)
             raise ParametersError(f"{error}. Are they of a model with other settings than {settings}?") from error
         if self._graphed_step is not None:
             # What was recorded reads and writes the tensors that the optimizers had before.

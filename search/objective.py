@@ -80,6 +80,7 @@ class Objective:
         self.config = config
         self.on_begin = on_begin
         self.folder = Path(folder)
+        self.commit = commit()
         self._checked: tuple[Any, int] | None = None
 
     def __call__(self, trial: optuna.Trial) -> float:
@@ -144,7 +145,7 @@ class Objective:
             "loss": "none" if aux_loss is None else str(aux_loss),
             "canonical": "none" if aux_loss is None else str(aux_loss.canonical()),
             "environment": environment,
-            "commit": commit(),
+            "commit": self.commit,
             "versions": versions(),
             "device": device_name(hyperparameters.get("device", "auto")),
             "threads": th.get_num_threads(),

@@ -238,7 +238,7 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
     :param runs: As :func:`read_runs` gives them
     :param n_resamples: Resamples of the bootstrap
     :return: One row for each ``checkpoint``, ``tasks`` (of which scale) and ``variant``: ``n_tasks``, ``asked``, ``runs`` that
-        count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has one run only)
+        count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has one run only), and the runs ``left_out``
     """
     rows = []
     scale = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
@@ -251,8 +251,9 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
             samples = list(matrix.to_numpy())
             interval = _interval(samples, _iqm, n_resamples)
             iqm = _iqm(*samples) if matrix.size else math.nan
-            rows.append((checkpoint, tasks, variant, len(common), len(asked), matrix.size, iqm, *interval))
-    columns = ["checkpoint", "tasks", "variant", "n_tasks", "asked", "runs", "iqm", "low", "high"]
+            left_out = asked["mean"].count() - matrix.size
+            rows.append((checkpoint, tasks, variant, len(common), len(asked), matrix.size, iqm, *interval, left_out))
+    columns = ["checkpoint", "tasks", "variant", "n_tasks", "asked", "runs", "iqm", "low", "high", "left_out"]
     return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
 
 
@@ -426,6 +427,8 @@ def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, b
             "The interquartile mean of fewer than four runs is their mean, and its interval goes from the smallest to the "
             "largest."
         )
+    if iqm["left_out"].any():
+        lines.append("Interquartile means leave out the seeds that a variant has on some of the tasks only.")
     if (better["probability"].isin([0, 1]) & (better["low"] == better["high"])).any():
         lines.append(
             "An interval without width says only that no run of one variant is better than any of the other: resampled runs "

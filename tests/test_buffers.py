@@ -665,6 +665,7 @@ BOTH = spaces.Dict({"image": IMAGE, "state": VECTOR, "table": TABLE})
         # What is taken out has no key any more.
         (lambda: DummyVecEnv([lambda: Labelled(Shown(VECTOR), 3)]), 1),
         (lambda: DummyVecEnv([lambda: Labelled(Shown(VECTOR), None)]), 1),
+        (lambda: DummyVecEnv([lambda: Labelled(FrameStackObservation(Shown(VECTOR), 3), None)]), 1),
         (lambda: VecExtractDictObs(VecFrameStack(DummyVecEnv([lambda: Shown(BOTH)]), 2), "state"), 1),
     ],
 )

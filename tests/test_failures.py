@@ -99,6 +99,7 @@ def test_exploding_q_values_stop_a_training(precision: str, aux_loss: AuxLoss | 
     with pytest.raises(ExplodedError) as error:
         model.learn(200)
     message = str(error.value)
+    assert isinstance(error.value, ValueError)  # RL-Zoo prunes trials that end with one
     assert "gradient step 2, agent step 22; auxiliary loss: " + str(aux_loss) in message
     assert "the error of the Q values is" in message and "gamma=0.99" in message
     # Everything is finite still: it is the size that is refused.

@@ -803,9 +803,14 @@ def test_an_infinite_buffer_is_not_a_divergence(tmp_path: pathlib.Path) -> None:
     with pytest.raises(ValueError, match=r"^my callback is wrong$"):
         model.learn(5, Broken())
     # What is averaged while it learns is watched all the same.
-    model.critic.features_extractor.norm.running_var[1] = math.inf
-    with pytest.raises(NonFiniteError, match="running_var is not finite"):
-        model.save(tmp_path / "other")
+    norm = model.critic.features_extractor.norm
+    for buffer, value in ((norm.running_var, math.inf), (model.critic.features_extractor.mask, math.nan)):
+        kept = buffer[1].item()
+        buffer[1] = value
+        with pytest.raises(NonFiniteError, match=r"(running_var|mask) is not finite"):
+            model.save(tmp_path / "other")
+        buffer[1] = kept
+    model.save(tmp_path / "other")
 
 
 def test_saving_a_loaded_model_changes_nothing(tmp_path: pathlib.Path) -> None:
@@ -829,7 +834,8 @@ def test_saving_a_loaded_model_changes_nothing(tmp_path: pathlib.Path) -> None:
 def test_loading_with_other_settings_says_what_is_wrong(tmp_path: pathlib.Path) -> None:
     make_model(aux_loss=None).save(tmp_path / "plain")
     make_model().save(tmp_path / "model")
-    for path, settings in (("plain", {"aux_loss": LOSS}), ("model", {"joint_optimizer": True})):
+    other: list[dict[str, Any]] = [{"joint_optimizer": True}, {"aux_loss": "{s_t, a_t} -> {s_t+1}"}, {"predictor_width": 20}]
+    for path, settings in (("plain", {"aux_loss": LOSS}), *(("model", settings) for settings in other)):
         with pytest.raises(ParametersError, match=r"Are they of a model with other settings than aux_loss=.*joint_optimizer="):
             SACAux.load(tmp_path / path, **settings)
 
@@ -856,9 +862,10 @@ def test_a_replay_buffer_without_windows_is_not_loaded(tmp_path: pathlib.Path) -
     assert plain.learn(30)._n_updates > 0
 
 
-@pytest.mark.parametrize("n_envs", [1, 2])
-def test_a_buffer_that_was_emptied_inside_an_episode(n_envs: int, caplog: pytest.LogCaptureFixture) -> None:
-    model = make_model("pixels", VecFrameStack(make_env("pixels", n_envs, length=50), 3, channels_order="first"))
+@pytest.mark.parametrize(("n_envs", "normalized"), [(1, False), (2, False), (2, True)])
+def test_a_buffer_that_was_emptied_inside_an_episode(n_envs: int, normalized: bool, caplog: pytest.LogCaptureFixture) -> None:
+    env: Any = VecFrameStack(make_env("pixels", n_envs, length=50), 3, channels_order="first")
+    model = make_model("pixels", VecNormalize(env, norm_obs=False) if normalized else env)
     model.learn(20)
     model.learn(4, reset_num_timesteps=False)
     assert not caplog.records  # it goes on inside the episode
@@ -891,6 +898,31 @@ def test_cropped_floats_reach_an_encoder_without_gaps() -> None:
     framed = np.zeros_like(image)
     framed[:, 1:-1, 2:-2] = image[:, 1:-1, 2:-2]
     assert not np.array_equal(framed, image) and np.array_equal(model.predict(framed, deterministic=True)[0], action)
+
+
+def test_a_training_that_a_callback_stopped_goes_on(caplog: pytest.LogCaptureFixture) -> None:
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            return self.n_calls < 7
+
+    for kind, stacked in (("state", False), ("pixels", True)):
+        env: Any = make_env(kind, length=50)
+        model = make_model(kind, VecFrameStack(env, 3, channels_order="first") if stacked else env)
+        model.learn(20, Stop())
+        assert model.num_timesteps == 7 and (model._last_obs is None) is stacked
+        model.learn(20, reset_num_timesteps=False)
+        assert model.replay_buffer.size() == 26  # the step that stopped it is not stored, as in SB3
+
+
+def test_other_envs_than_those_of_the_saved_model(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
+    make_model(env=VecNormalize(make_env("state"))).learn(30).save(tmp_path / "model")
+    loaded = SACAux.load(tmp_path / "model", env=VecNormalize(make_env("state", 2)), device="cpu")
+    assert loaded.learn(40)._n_updates > 0 and loaded.replay_buffer.n_envs == 2
+    stacked = make_model("pixels", VecNormalize(VecFrameStack(make_env("pixels"), 3, channels_order="first"), norm_obs=False))
+    stacked.learn(20)
+    stacked.replay_buffer.reset()
+    stacked.learn(20)  # from the beginning: nothing to say
+    assert not caplog.records
 
 
 def test_an_actor_that_is_frozen_stays_as_it_is() -> None:

@@ -262,6 +262,8 @@ def test_every_task_weighs_the_same_in_an_interquartile_mean(tmp_path: Path) -> 
     assert rows.loc["none", ["iqm", "low", "high"]].isna().all()
     shown = runner.invoke(app, ["table", str(tmp_path)])
     assert shown.exit_code == 0 and re.search(r"none +│ - +│ - +│ 0/3 ", shown.stdout), shown.output
+    assert rows["left_out"].to_dict() == {"all": 0, "some": 7, "none": 3}
+    assert "leave out the seeds that a variant has on some of the tasks only" in " ".join(shown.stdout.split())
 
 
 @pytest.mark.parametrize(("of_other", "says"), [([1.0, 2.0], True), ([1.0, 4.0], False), ([3.0, 5.0], False)])
