@@ -1,5 +1,6 @@
 """results/README.md says what the runs beside it say, and each of them can be made again with the command that it names."""
 
+import inspect
 import json
 import re
 import runpy
@@ -12,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import search.cli
+from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from search.benchmark import Benchmark, load_benchmark, read_abouts, run_folder
 from search.provenance import ABOUT
@@ -103,12 +105,32 @@ def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             assert [point.environment_steps for point in read_curve(path / "curve.csv")] == about["evaluations"]
 
 
+def last_returns(folder: str, variant: str, task: str = "cheetah-run") -> list[float]:
+    """Returns of the last evaluations, one for each seed."""
+    curves = sorted((RESULTS / folder / variant / task).glob("seed-*/curve.csv"))
+    return [read_curve(curve)[-1].mean for curve in curves]
+
+
+def test_what_was_decided() -> None:
+    """What results/choices_small/about.md says of the runs beside it, and that it is what SACAux does."""
+    default, separate, joint, predictor = (
+        last_returns("choices_small", f"aarl_state_small{choice}") for choice in ("", "_separate", "_joint", "_predictor")
+    )
+    assert min(map(len, (default, separate, joint, predictor))) >= 3
+    assert max(joint) < min(default)
+    for other in (separate, predictor):
+        assert statistics.mean(other) < statistics.mean(default) and statistics.stdev(other) > statistics.stdev(default)
+    arguments = inspect.signature(SACAux).parameters
+    of_policy = inspect.signature(SACAux.policy_aliases["MlpPolicy"]).parameters
+    assert arguments["joint_optimizer"].default is False and of_policy["share_features_extractor"].default is True
+    assert (arguments["predictor_width"].default, arguments["predictor_batch_norm"].default) == (256, False)
+
+
 def test_the_figures_of_the_first_readme() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     said = ["here"]
     for variant in ("aarl_state_bf16", "sac_dense_mlp_bf16", "curl_state_bf16", "sac_identity_bf16"):
-        curves = sorted((RESULTS / "choices" / variant / "cheetah-run").glob("seed-*/curve.csv"))
-        returns = [read_curve(curve)[-1].mean for curve in curves]
+        returns = last_returns("choices", variant)
         said.append(f"{statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f}")
         assert f"{len(returns)} seeds" in readme
     assert " | ".join(said) in readme

@@ -173,6 +173,7 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
         {"precision": "bf16", "policy_kwargs": {"ortho_init": True, "squash_log_std": (-10, 2)}},
     ),
     "aarl_state_small": ("aarl_state", SMALL),
+    "aarl_state_small_bf16": ("aarl_state", {**SMALL, "precision": "bf16"}),
     "aarl_state_small_joint": ("aarl_state", {**SMALL, "joint_optimizer": True}),
     "aarl_state_small_predictor": ("aarl_state", {**SMALL, "predictor_width": None, "predictor_batch_norm": True}),
     "aarl_state_small_separate": ("aarl_state", merge(SMALL, {"policy_kwargs": {"share_features_extractor": False}})),
