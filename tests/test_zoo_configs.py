@@ -175,9 +175,11 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "aarl_state_small": ("aarl_state", SMALL),
     "aarl_state_small_bf16": ("aarl_state", {**SMALL, "precision": "bf16"}),
     "aarl_state_small_joint": ("aarl_state", {**SMALL, "joint_optimizer": True}),
+    "aarl_state_small_orthogonal": ("aarl_state", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "aarl_state_small_predictor": ("aarl_state", {**SMALL, "predictor_width": None, "predictor_batch_norm": True}),
     "aarl_state_small_separate": ("aarl_state", merge(SMALL, {"policy_kwargs": {"share_features_extractor": False}})),
     "sac_dense_mlp_small": ("sac_dense_mlp", SMALL),
+    "sac_dense_mlp_small_orthogonal": ("sac_dense_mlp", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "sac_identity_small": ("sac_identity", SMALL),
     "sac_identity_small_orthogonal": ("sac_identity", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "sac_identity_small_orthogonal_squashed": (
