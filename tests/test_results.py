@@ -134,3 +134,9 @@ def test_the_figures_of_the_first_readme() -> None:
         said.append(f"{statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f}")
         assert f"{len(returns)} seeds" in readme
     assert " | ".join(said) in readme
+    for variant, before in (("aarl_state_small", "AARL-State gets"), ("aarl_state_small_joint", "and")):
+        returns = last_returns("choices_small", variant)
+        assert f"{before} {statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f} " in readme
+    abouts = read_abouts(RESULTS / "choices_small")[0].values()
+    minutes = [about["seconds"] / 60 for about in abouts if about["variant"] == "aarl_state_small"]
+    assert f"in {min(minutes):.0f} to {max(minutes):.0f} minutes of one core" in readme
