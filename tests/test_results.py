@@ -120,6 +120,10 @@ def test_what_was_decided() -> None:
     assert max(joint) < min(default)
     for other in (separate, predictor):
         assert statistics.mean(other) < statistics.mean(default) and statistics.stdev(other) > statistics.stdev(default)
+    identity, *orthogonal = (
+        last_returns("choices_small", f"sac_identity_small{choice}") for choice in ("", "_orthogonal", "_orthogonal_squashed")
+    )
+    assert all(len(runs) >= 3 and statistics.stdev(runs) < statistics.stdev(identity) for runs in orthogonal)
     arguments = inspect.signature(SACAux).parameters
     of_policy = inspect.signature(SACAux.policy_aliases["MlpPolicy"]).parameters
     assert arguments["joint_optimizer"].default is False and of_policy["share_features_extractor"].default is True
