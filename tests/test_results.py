@@ -118,6 +118,8 @@ def test_what_was_decided() -> None:
     )
     assert min(map(len, (default, separate, joint, predictor))) >= 3
     assert max(joint) < min(default)
+    baseline = last_returns("choices_small", "sac_dense_mlp_small")
+    assert len(baseline) >= 3 and max(baseline) < min(default + separate + joint + predictor)
     for other in (separate, predictor):
         assert statistics.mean(other) < statistics.mean(default) and statistics.stdev(other) > statistics.stdev(default)
     identity, *orthogonal = (
