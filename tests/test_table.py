@@ -6,6 +6,7 @@ import math
 import re
 import shutil
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -275,7 +276,7 @@ def test_intervals_without_width_are_explained(tmp_path: Path, of_other: list[fl
     assert ("An interval without width" in text) is says
     for n_runs, probability in ((2, "1/3"), (3, "1/10"), (5, "1/126")):
         together = stats.mannwhitneyu(range(n_runs), range(n_runs, 2 * n_runs), method="exact").pvalue
-        assert together == pytest.approx(eval(probability)) and (probability in text) is says
+        assert together == pytest.approx(float(Fraction(probability))) and (probability in text) is says
 
 
 def test_one_run_has_neither_deviation_nor_interval_nor_mark(tmp_path: Path) -> None:
