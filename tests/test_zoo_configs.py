@@ -181,6 +181,7 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "sac_dense_mlp_small": ("sac_dense_mlp", SMALL),
     "sac_dense_mlp_small_orthogonal": ("sac_dense_mlp", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "sac_identity_small": ("sac_identity", SMALL),
+    "sac_identity_small_bf16": ("sac_identity", {**SMALL, "precision": "bf16"}),
     "sac_identity_small_orthogonal": ("sac_identity", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "sac_identity_small_orthogonal_squashed": (
         "sac_identity",
