@@ -95,7 +95,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
     yield "```bash"
     yield from commands(about for _, about in finished)
     yield "```\n"
-    yield from cost([about for _, about in finished])
+    yield from cost([about for _, about in finished if "program" not in about])
 
 
 def printed_table(folder: Path) -> str:
@@ -148,7 +148,8 @@ def commands(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
         steps, checkpoints = about["evaluations"], about["checkpoints"]
         # The interval between checkpoints: the one that gives these evaluations.
         every = [step for step in steps if sorted({*checkpoints, *range(step, steps[-1], step)}) == steps]
-        before = ["aarl", "benchmark", about["file"], "--envs", task_name(about["environment"])]
+        program = shlex.split(about.get("program", "aarl benchmark"))  # else it is emulated_bf16.py
+        before = [*program, about["file"], "--envs", task_name(about["environment"])]
         after = ["--checkpoints", ",".join(map(str, checkpoints))]
         after += ["--every", str(every[0])] if steps != checkpoints else []
         after += ["--episodes", str(about["evaluation_episodes"]), "--threads", str(about["sessions"][-1]["threads"])]

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+import search.benchmark
 import search.cli
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
@@ -27,10 +28,15 @@ def asked_for(folder: Path, command: str, monkeypatch: pytest.MonkeyPatch) -> li
     """What a printed command would train."""
     trained: list[Benchmark] = []
     monkeypatch.setattr(search.cli, "_train_grid", lambda grid, *_: (trained.append(grid), {}))
-    program, *words = shlex.split(command)
-    assert program == "aarl"
     with monkeypatch.context() as patch:
         patch.chdir(RESULTS.parent)
+        program, *words = shlex.split(command)
+        if program == "python":
+            emulated = runpy.run_path(words[0])
+            patch.setattr(search.benchmark, "load_benchmark", emulated["load_benchmark"])
+            words[0] = "benchmark"
+        else:
+            assert program == "aarl"
         CliRunner().invoke(search.cli.app, [*words, "--out", str(folder / "again")])
     (grid,) = trained
     return [grid.about(cell) for cell in grid.cells]
@@ -88,6 +94,25 @@ def test_commands_have_the_interval(
     (command,) = make_readme["commands"](abouts)
     assert "--seeds 0,2" in command and ("--every" in command) is (every is not None)
     assert asked_for(tmp_path, command, monkeypatch) == [grid.about(cell) for cell in grid.cells]
+
+
+def test_what_was_emulated_is_made_again_so_and_costs_nothing_that_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(RESULTS.parent)
+    load = runpy.run_path("results/emulated_bf16.py")["load_benchmark"]
+    grid = load([Path("zoo_configs/choices/sac_identity_small_bf16.yml")], ["cheetah-run"], [1], [100_000])
+    (cell,) = grid.cells
+    path = run_folder(tmp_path / "results" / "planted", cell)
+    path.mkdir(parents=True)
+    write_curve(path / "curve.csv", [Evaluation(100_000, 30.0, 1.0, 10, 7200.0)])
+    (path / ABOUT).write_text(json.dumps({**grid.about(cell), "sessions": [SESSION], "seconds": 7200.0}))
+    (path.parents[2] / "about.md").write_text("Planted\nWhat is said.\n")
+    text = make_readme["readme"](tmp_path / "results")
+    (command,) = commands(text)
+    assert command.startswith("python results/emulated_bf16.py zoo_configs/")
+    assert asked_for(tmp_path, command, monkeypatch) == [grid.about(cell)]
+    assert "| 30.0 | 120 | 2 | a processor |" in text and "| sac_identity_small_bf16 | 1 | 7,200" not in text
 
 
 def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
