@@ -504,11 +504,7 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
 
     from search import table as tables
 
-    runs = tables.read_runs(folder)
-    number = tables.closest_table(runs["variant"]) if number is None else number
-    runs = tables.in_order(runs, number)
-    comparison = tables.compare(runs, number)
-    iqm, better = tables.interquartile_means(runs), tables.improvements(runs)
+    number, runs, comparison, iqm, better = tables.read_tables(folder, number)
     if csv is not None:
         comparison.to_csv(csv, index=False)
     if json is not None:

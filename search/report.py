@@ -230,11 +230,7 @@ def _taught(study: Study, trials: Sequence[FrozenTrial]) -> dict[str, Any] | Non
 
 def _benchmark(folder: Path) -> dict[str, Any]:
     """The tables of a benchmark and its learning curves."""
-    runs = tables.read_runs(folder)
-    number = tables.closest_table(runs["variant"])
-    runs = tables.in_order(runs, number)
-    comparison = tables.compare(runs, number)
-    iqm, better = tables.interquartile_means(runs), tables.improvements(runs)
+    number, runs, comparison, iqm, better = tables.read_tables(folder)
     shown = tables.statistics_tables(iqm, better)
     return {
         "folder": folder,

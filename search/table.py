@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -351,6 +351,33 @@ def mixed(runs: pd.DataFrame) -> list[str]:
     counts = commits(runs)
     of_each = "; ".join(f"{commit} ({count})" for commit, count in counts.items())
     return [f"Runs of several commits or versions: {of_each}"] if len(counts) > 1 else []
+
+
+class Tables(NamedTuple):
+    """
+    What there is to say of a benchmark: the table of the paper beside it, its runs in that table's order, and of these what
+    :func:`compare`, :func:`interquartile_means` and :func:`improvements` say.
+    """
+
+    number: int | None
+    runs: pd.DataFrame
+    comparison: pd.DataFrame
+    iqm: pd.DataFrame
+    better: pd.DataFrame
+
+
+def read_tables(folder: Path, number: int | None = None) -> Tables:
+    """
+    Everything that is shown of a benchmark.
+
+    :param folder: Folder of a benchmark
+    :param number: Table of the paper, None for the one with most of the variants
+    :raises ValueError: as :func:`read_runs`
+    """
+    runs = read_runs(folder)
+    number = closest_table(runs["variant"]) if number is None else number
+    runs = in_order(runs, number)
+    return Tables(number, runs, compare(runs, number), interquartile_means(runs), improvements(runs))
 
 
 def score_tables(comparison: pd.DataFrame) -> list[Table]:
