@@ -345,5 +345,5 @@ def _checkpoints(
 
 def _training(about: Mapping[str, Any]) -> dict[str, Any]:
     """What decides a run's scores."""
-    settings = {"evaluation_episodes": about.get("evaluation_episodes"), **about.get("hyperparameters", {})}
+    settings = {name: about.get(name) for name in ("evaluation_episodes", "program")} | about.get("hyperparameters", {})
     return {key: value for key, value in settings.items() if key not in SCORELESS}

@@ -44,14 +44,14 @@ def commit() -> str:
 
 
 def cpu() -> str:
-    """The processor's name and how many of its cores this process may use."""
+    """The processor's name, how many of its cores this process may use, and which of its instructions PyTorch uses."""
     name = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
         names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
         name = names[0] if names else name
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{name}, {cores} cores"
+    return f"{name}, {cores} cores, {th.backends.cpu.get_cpu_capability()}"
 
 
 @functools.cache
@@ -68,10 +68,12 @@ def versions() -> str:
 
 def provenance() -> dict[str, str]:
     """What has to stand beside every figure: commit, command, date, hardware, versions."""
+    name = Path(sys.argv[0]).name
+    program = "aarl" if name == "cli.py" else name  # that is python -m search.cli
     return {
         "commit": commit(),
         # It stands in notes and reports, which others read.
-        "command": " ".join(storage_name(argument) for argument in [Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": " ".join(storage_name(argument) for argument in [program, *sys.argv[1:]]),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "cpu": cpu(),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else "none",

@@ -88,7 +88,8 @@ def read_runs(folder: Path) -> pd.DataFrame:
     """
     What a benchmark's folder has: one row for each checkpoint of each run that was asked for, with ``variant``,
     ``environment``, ``seed``, ``checkpoint`` (environment steps), ``mean`` (return; NaN if it is missing), ``reason`` (why it
-    is missing, else empty), ``commit`` and ``versions`` (of all sessions that trained it).
+    is missing, else empty), ``commit`` and ``versions`` (of all sessions that trained it), and the ``program`` if it was not
+    ``aarl benchmark``.
 
     :param folder: Folder of a benchmark; runs that were copied there from another machine count too
     :raises ValueError: when there are none, when one cannot be read, and as :func:`search.benchmark.read_abouts` does
@@ -108,10 +109,10 @@ def read_runs(folder: Path) -> pd.DataFrame:
             raise ValueError(f"{path} is not what a benchmark leaves: {ABOUT} cannot be read")
         run = (path.parent.parent.name, of_task[task]["environment"], int(seed))
         reason = f"its {ABOUT} cannot be read"
-        rows += [(*run, checkpoint, math.nan, reason, "", "") for checkpoint in of_task[task]["checkpoints"]]
+        rows += [(*run, checkpoint, math.nan, reason, "", "", "") for checkpoint in of_task[task]["checkpoints"]]
     if not rows:
         raise ValueError(f"{folder} has no runs of a benchmark")
-    columns = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions"]
+    columns = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions", "program"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -133,7 +134,7 @@ def _points(path: Path, about: dict[str, Any]) -> list[tuple[Any, ...]]:
             begun = f"unfinished, evaluated up to {max(points, default=0):,}" if about["sessions"] else "not begun"
             reason = about.get("failed", begun)
         run = (about["variant"], about["environment"], about["seed"])
-        rows.append((*run, checkpoint, math.nan if reason else mean, reason, commits, versions))
+        rows.append((*run, checkpoint, math.nan if reason else mean, reason, commits, versions, about.get("program", "")))
     return rows
 
 
@@ -344,13 +345,17 @@ def commits(runs: pd.DataFrame) -> dict[str, int]:
 
 def mixed(runs: pd.DataFrame) -> list[str]:
     """
-    A line if runs were trained with several commits or versions, as :func:`commits` counts them.
+    A line if runs were trained with several commits or versions, as :func:`commits` counts them, and one for each program
+    that is not ``aarl benchmark``.
 
     :param runs: As :func:`read_runs` gives them
     """
     counts = commits(runs)
     of_each = "; ".join(f"{commit} ({count})" for commit, count in counts.items())
-    return [f"Runs of several commits or versions: {of_each}"] if len(counts) > 1 else []
+    lines = [f"Runs of several commits or versions: {of_each}"] if len(counts) > 1 else []
+    for program, of_program in runs[runs["program"] != ""].groupby("program"):
+        lines.append(f"Trained by {program}: {', '.join(dict.fromkeys(of_program['variant']))}")
+    return lines
 
 
 class Tables(NamedTuple):

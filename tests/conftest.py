@@ -24,7 +24,7 @@ torch.set_num_threads(1)
 
 @pytest.fixture(autouse=True)
 def seeded() -> None:
-    """Global generators start alike in every test: else a statistic beyond its threshold fails one run in a hundred."""
+    """numpy's and torch's global generators start alike in every test: or a statistic is beyond its threshold some day."""
     np.random.seed(0)
     torch.manual_seed(0)
 

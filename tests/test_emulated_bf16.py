@@ -1,6 +1,8 @@
 """results/emulated_bf16.py gives what bfloat16 is, and trains runs of a benchmark with it."""
 
+import re
 import runpy
+import shutil
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,13 +24,15 @@ EmulatedBfloat16: type[TorchDispatchMode] = emulated["EmulatedBfloat16"]
 
 
 class Natively(TorchDispatchMode):
-    """Counts products of bfloat16 that PyTorch is asked for."""
+    """What PyTorch is asked to do with bfloat16."""
 
-    products = 0
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: set[Any] = set()
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        of = {arg.dtype for arg in args if isinstance(arg, th.Tensor)}
-        self.products += function in emulated["PRODUCTS"] and of == {th.bfloat16}
+        if any(isinstance(arg, th.Tensor) and arg.dtype == th.bfloat16 for arg in args):
+            self.asked.add(function)
         return function(*args, **(kwargs or {}))
 
 
@@ -54,7 +58,10 @@ def test_gradients_are_those_of_bfloat16() -> None:
         model = filled_model(precision=precision, policy_delay=1, aux_loss="{s_t, a_t} -> {s_t+1, r_t} [bilinear]", **rates)
         with Natively() as natively, mode:
             model.train(1, batch_size=128)
-        assert (natively.products > 0) is (precision == "bf16" and isinstance(mode, nullcontext))
+        products = {function for function in natively.asked if re.search("mm|mv|dot|linear|matmul|conv|einsum", str(function))}
+        is_native = precision == "bf16" and isinstance(mode, nullcontext)
+        assert bool(natively.asked) is (precision == "bf16") and bool(products) is is_native
+        assert products <= emulated["PRODUCTS"]  # there is no other
         trained = [*model.critic.parameters(), *model.aux_head.parameters(), *model.actor.own_parameters()]
         gradients.append(th.cat([parameter.grad.flatten() for parameter in trained]))
     exact, native, found = gradients
@@ -66,10 +73,15 @@ def test_runs_are_trained_with_it_and_say_so(tmp_path: Path, monkeypatch: pytest
     choices = ROOT / "zoo_configs" / "choices"
     with pytest.raises(ValueError, match=r"sac_identity_small\.yml does not say precision: bf16"):
         emulated["load_benchmark"]([choices / "sac_identity_small.yml"], ["cheetah-run"], [0], [1000])
+    pixels = tmp_path / "pixels.yml"
+    pixels.write_text(
+        (ROOT / "zoo_configs" / "aarl_pixel.yml").read_text().replace("CnnPolicy", "CnnPolicy\n  precision: bf16")
+    )
+    with pytest.raises(ValueError, match=r"pixels\.yml does not say policy: MlpPolicy"):
+        emulated["load_benchmark"]([pixels], ["cheetah-run"], [0], [1000])
     grid = emulated["load_benchmark"]([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [5], [1000])
     plain = search.benchmark.load_benchmark([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [5], [1000])
     (cell,) = grid.cells
-    assert grid.trainings == plain.trainings
     assert grid.about(cell) == {**plain.about(cell), "program": "python results/emulated_bf16.py"}
 
     modes = []
@@ -84,3 +96,15 @@ def test_runs_are_trained_with_it_and_say_so(tmp_path: Path, monkeypatch: pytest
     assert [type(mode) for mode in modes] == [EmulatedBfloat16] and _get_current_dispatch_mode() is None
     (about,) = (read_about(path.parent) for path in tmp_path.rglob("provenance.json"))
     assert about["program"] == emulated["PROGRAM"] and about["seconds"] == 2.0
+
+    # Neither program goes on with what the other has begun, nor is it shown as one variant.
+    emulated["load_benchmark"]([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [5], [1000]).prepare(tmp_path)
+    with pytest.raises(ValueError, match="begun with program='python results/emulated_bf16.py'"):
+        plain.prepare(tmp_path)
+    other = tmp_path / "other"
+    plain = search.benchmark.load_benchmark([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [6], [1000])
+    plain.prepare(other)
+    (run,) = (path.parent for path in other.rglob("provenance.json"))
+    shutil.copytree(run, tmp_path / run.relative_to(other))
+    with pytest.raises(ValueError, match="cannot be compared: program="):
+        search.benchmark.read_abouts(tmp_path)

@@ -168,8 +168,10 @@ def test_a_password_in_a_url_with_an_error_is_not_shown(where: str, tmp_path: Pa
         assert "s3cret" not in result.output
 
 
-def test_the_command_in_notes_and_reports_has_no_password(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["/bin/aarl", "search", "a.yml", "--storage", "postgresql://me:se cret@host/db"])
+@pytest.mark.parametrize("program", ["/bin/aarl", "/work/search/cli.py"])
+def test_the_command_in_notes_and_reports_has_no_password(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+    arguments = ["search", "a.yml", "--storage", "postgresql://me:se cret@host/db"]
+    monkeypatch.setattr("sys.argv", [program, *arguments])
     assert provenance.provenance()["command"] == "aarl search a.yml --storage postgresql://me:***@host/db"
 
 
