@@ -99,7 +99,7 @@ def test_runs_are_trained_with_it_and_say_so(tmp_path: Path, monkeypatch: pytest
 
     # Neither program goes on with what the other has begun, nor is it shown as one variant.
     emulated["load_benchmark"]([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [5], [1000]).prepare(tmp_path)
-    with pytest.raises(ValueError, match="begun with program='python results/emulated_bf16.py'"):
+    with pytest.raises(ValueError, match=r"begun with program='python results/emulated_bf16\.py'"):
         plain.prepare(tmp_path)
     other = tmp_path / "other"
     plain = search.benchmark.load_benchmark([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [6], [1000])

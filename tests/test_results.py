@@ -18,6 +18,7 @@ from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from search.benchmark import Benchmark, load_benchmark, read_abouts, run_folder
 from search.provenance import ABOUT
+from search.table import paper_scores, read_tables
 
 RESULTS = Path(__file__).parent.parent / "results"
 make_readme: dict[str, Any] = runpy.run_path(str(RESULTS / "make_readme.py"))
@@ -142,15 +143,19 @@ def last_returns(folder: str, variant: str, task: str = "cheetah-run") -> list[f
 
 def test_what_was_decided() -> None:
     """What results/choices_small/about.md says of the runs beside it, and that it is what SACAux does."""
-    default, separate, joint, predictor = (
-        last_returns("choices_small", f"aarl_state_small{choice}") for choice in ("", "_separate", "_joint", "_predictor")
-    )
-    assert min(map(len, (default, separate, joint, predictor))) >= 3
-    assert max(joint) < min(default)
-    baseline = last_returns("choices_small", "sac_dense_mlp_small")
-    assert len(baseline) >= 3 and max(baseline) < min(default + separate + joint + predictor)
-    for other in (separate, predictor):
-        assert statistics.mean(other) < statistics.mean(default) and statistics.stdev(other) > statistics.stdev(default)
+    choices = ("", "_separate", "_joint", "_predictor")
+    for task in ("cheetah-run", "walker-walk"):
+        runs = [last_returns("choices_small", f"aarl_state_small{choice}", task) for choice in choices]
+        default, separate, joint, predictor = runs
+        assert min(map(len, runs)) >= 3
+        assert max(joint) < min(default + separate + predictor)
+        for other in (separate, predictor):
+            assert statistics.mean(other) < statistics.mean(default) and statistics.stdev(other) > statistics.stdev(default)
+        if task == "walker-walk":
+            assert max(separate) < min(default)
+        else:
+            baseline = last_returns("choices_small", "sac_dense_mlp_small")
+            assert len(baseline) >= 3 and max(baseline) < min(default + separate + joint + predictor)
     identity, *orthogonal = (
         last_returns("choices_small", f"sac_identity_small{choice}") for choice in ("", "_orthogonal", "_orthogonal_squashed")
     )
@@ -169,9 +174,21 @@ def test_the_figures_of_the_first_readme() -> None:
         said.append(f"{statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f}")
         assert f"{len(returns)} seeds" in readme
     assert " | ".join(said) in readme
-    for variant, before in (("aarl_state_small", "AARL-State gets"), ("aarl_state_small_joint", "and")):
-        returns = last_returns("choices_small", variant)
-        assert f"{before} {statistics.mean(returns):.0f} ± {statistics.stdev(returns):.0f} " in readme
+    paper = paper_scores(4).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'").set_index("column")
+    of_paper = [paper.loc[column] for column in ("AARL-State", "SAC", "CURL", "SAC-Identity")]
+    assert " | ".join(["paper", *(f"{score['mean']:.0f} ± {score['std']:.0f}" for score in of_paper)]) in readme
+    marks = read_tables(RESULTS / "choices").comparison.set_index("variant")["mark"]
+    assert "All but SAC are more than two standard errors from the paper's" in readme
+    assert {variant for variant, mark in marks.items() if not mark} == {"sac_dense_mlp_bf16"}
+    minutes = [about["seconds"] / 60 for about in read_abouts(RESULTS / "choices")[0].values()]
+    assert f"A run takes {min(minutes):.0f} to {max(minutes):.0f} minutes of one core" in readme
+
+    def both(variant: str, between: str) -> str:
+        returns = [last_returns("choices_small", variant, task) for task in ("cheetah-run", "walker-walk")]
+        return between.join(f"{statistics.mean(of_task):.0f} ± {statistics.stdev(of_task):.0f}" for of_task in returns)
+
+    assert f"AARL-State gets {both('aarl_state_small', ' there, and ')} on Walker-Walk" in readme
+    assert f"; {both('aarl_state_small_joint', ' and ')} where one optimizer" in readme
     abouts = read_abouts(RESULTS / "choices_small")[0].values()
     minutes = [about["seconds"] / 60 for about in abouts if about["variant"] == "aarl_state_small"]
     assert f"in {min(minutes):.0f} to {max(minutes):.0f} minutes of one core" in readme
