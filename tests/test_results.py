@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import math
 import re
 import runpy
 import shlex
@@ -149,19 +150,24 @@ def test_what_was_decided() -> None:
         default, separate, joint, predictor = runs
         assert min(map(len, runs)) >= 3
         assert max(joint) < min(default + separate + predictor)
+        bf16 = last_returns("choices_small", "aarl_state_small_bf16", task)
+        error = math.sqrt(sum(statistics.variance(of_precision) / len(of_precision) for of_precision in (default, bf16)))
+        assert len(bf16) >= 3 and abs(statistics.mean(default) - statistics.mean(bf16)) < 2 * error
+        assert statistics.stdev(bf16) > statistics.stdev(default)
         for other in (separate, predictor):
             assert statistics.mean(other) < statistics.mean(default) and statistics.stdev(other) > statistics.stdev(default)
         if task == "walker-walk":
-            assert max(separate) < min(default)
+            assert max(separate) < min(default) and min(bf16) < 0.75 * min(default)
         else:
             baseline = last_returns("choices_small", "sac_dense_mlp_small")
-            assert len(baseline) >= 3 and max(baseline) < min(default + separate + joint + predictor)
+            assert len(baseline) >= 3 and max(baseline) < min(default + separate + joint + predictor + bf16)
     identity, *orthogonal = (
         last_returns("choices_small", f"sac_identity_small{choice}") for choice in ("", "_orthogonal", "_orthogonal_squashed")
     )
     assert all(len(runs) >= 3 and statistics.stdev(runs) < statistics.stdev(identity) for runs in orthogonal)
     arguments = inspect.signature(SACAux).parameters
     of_policy = inspect.signature(SACAux.policy_aliases["MlpPolicy"]).parameters
+    assert arguments["precision"].default == "fp32"
     assert arguments["joint_optimizer"].default is False and of_policy["share_features_extractor"].default is True
     assert (arguments["predictor_width"].default, arguments["predictor_batch_norm"].default) == (256, False)
 
@@ -189,6 +195,7 @@ def test_the_figures_of_the_first_readme() -> None:
 
     assert f"AARL-State gets {both('aarl_state_small', ' there, and ')} on Walker-Walk" in readme
     assert f"; {both('aarl_state_small_joint', ' and ')} where one optimizer" in readme
+    assert f"in bfloat16 {both('aarl_state_small_bf16', ' and ')}, emulated" in readme
     abouts = read_abouts(RESULTS / "choices_small")[0].values()
     minutes = [about["seconds"] / 60 for about in abouts if about["variant"] == "aarl_state_small"]
     assert f"in {min(minutes):.0f} to {max(minutes):.0f} minutes of one core" in readme
