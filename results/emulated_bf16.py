@@ -10,7 +10,6 @@ repository, with the options of ``aarl benchmark``; runs say in their provenance
 both programs are not compared.
 """
 
-import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -58,7 +57,7 @@ def load_benchmark(*args: Any, **kwargs: Any) -> EmulatedBenchmark:
         for name, needed in (("precision", "bf16"), ("policy", "MlpPolicy")):
             if any(values.get(name) != needed for values in settings.values()):
                 raise ValueError(f"{loaded.files[variant]} does not say {name}: {needed}; aarl benchmark trains it")
-    return EmulatedBenchmark(**{field.name: getattr(loaded, field.name) for field in dataclasses.fields(loaded)})
+    return EmulatedBenchmark(**vars(loaded))
 
 
 load = benchmark.load_benchmark
