@@ -178,6 +178,7 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "aarl_state_small_orthogonal": ("aarl_state", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "aarl_state_small_predictor": ("aarl_state", {**SMALL, "predictor_width": None, "predictor_batch_norm": True}),
     "aarl_state_small_separate": ("aarl_state", merge(SMALL, {"policy_kwargs": {"share_features_extractor": False}})),
+    "curl_state_small": ("curl_state", SMALL),
     "sac_dense_mlp_small": ("sac_dense_mlp", SMALL),
     "sac_dense_mlp_small_orthogonal": ("sac_dense_mlp", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "sac_identity_small": ("sac_identity", SMALL),
