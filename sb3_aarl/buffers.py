@@ -1,6 +1,7 @@
 """WindowReplayBuffer: windows of consecutive steps out of a replay buffer that stores each frame once."""
 
 import math
+import warnings
 import weakref
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -17,6 +18,11 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 from sb3_aarl.augmentation import image_spaces
+
+try:
+    import psutil
+except ImportError:  # an extra of SB3
+    psutil = None  # type: ignore[assignment]
 
 
 class WindowSamples(NamedTuple):
@@ -327,6 +333,21 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self.dones = np.zeros(size, np.float32)
         self.timeouts = np.zeros(size, np.float32)
         self._clear()
+        self._warn_of_memory()
+
+    def _warn_of_memory(self) -> None:
+        """As SB3 does: memory is taken as it fills, which may be hours later."""
+        if psutil is None:
+            return
+        arrays = [self.actions, self.rewards, self.dones, self.timeouts]
+        arrays += [store.frames for store in self.stores.values() if store.device is None]
+        needed, available = sum(array.nbytes for array in arrays), psutil.virtual_memory().available
+        if needed > available:
+            warnings.warn(
+                f"This system does not seem to have enough memory for the whole replay buffer: {needed / 1e9:.2f} GB of "
+                f"{available / 1e9:.2f} GB",
+                stacklevel=3,
+            )
 
     def _clear(self) -> None:
         size = (self.buffer_size, self.n_envs)
@@ -521,7 +542,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
             f"(env {env}, transition {self.n_added}): {problem}. The stack has to be the outermost observation wrapper, along "
             "the channels, oldest frame first: action repeat, rendering and resizing inside, FrameStackObservation or "
             "VecFrameStack outside. If observations are no stacks, pass replay_buffer_kwargs=dict(frame_stack=1); if the "
-            "buffer was emptied inside an episode, reset the environments too"
+            "buffer was emptied inside an episode, reset the environments too; if somebody else stepped them since, such as "
+            "evaluate_policy(model, model.get_env()), call learn() again: it resets them first"
         )
 
     def sample(  # type: ignore[override]
@@ -628,6 +650,14 @@ class WindowReplayBuffer(NStepReplayBuffer):
         )
 
 
+def _gymnasium_stack(env: VecEnv) -> Any:
+    try:
+        wrapped = env.env_is_wrapped(FrameStackObservation)
+        return env.get_attr("stack_size")[0] if wrapped and all(wrapped) else 1
+    except (NotImplementedError, AttributeError):
+        return 1  # a VecEnv that does not say what it is made of
+
+
 def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
     """
     How many frames an environment stacks along the first axis of observations, as its wrappers tell.
@@ -646,7 +676,7 @@ def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
         stack = outer.stacked_obs.n_stack
         inner = getattr(outer.stacked_obs, "sub_stacked_observations", {"": outer.stacked_obs})
     else:
-        stack = env.get_attr("stack_size")[0] if all(env.env_is_wrapped(FrameStackObservation)) else 1
+        stack = _gymnasium_stack(env)
         stack = stack if isinstance(stack, int) and stack > 0 else 1  # of a wrapper outside of it
     stacks: dict[str, int] = {}
     for key, part in parts.items():

@@ -3,11 +3,14 @@
 import copy
 import io
 import pickle
+import types
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import psutil
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -442,6 +445,22 @@ def test_memory_of_states_and_of_last_observations():
     assert measured_bytes(ours.stores) < 0.55 * both
     # The places of last observations are used again as the ring goes round.
     assert 50 <= ours.stores[""].final_frames.shape[0] <= 128
+
+
+@pytest.mark.parametrize("enough", [True, False])
+def test_a_buffer_that_memory_has_no_room_for(enough, monkeypatch):
+    space, actions = spaces.Box(0, 255, (6, 30, 40), np.uint8), spaces.Box(-1, 1, (2,))
+    kwargs = {"frame_stack": 2, "n_envs": 2}
+    buffer = WindowReplayBuffer(1000, space, actions, "cpu", **kwargs)
+    parts = [buffer.stores[""].frames, buffer.actions, buffer.rewards, buffer.dones, buffer.timeouts]
+    needed = sum(array.nbytes for array in parts)
+    assert needed > 2 * 502 * 3 * 30 * 40
+    available = types.SimpleNamespace(available=needed if enough else needed - 1)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: available)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        WindowReplayBuffer(1000, space, actions, "cpu", **kwargs)
+    assert ["enough memory for the whole replay buffer" in str(warning.message) for warning in caught] == [True] * (not enough)
 
 
 def test_what_is_sampled_is_not_the_buffer_itself():
