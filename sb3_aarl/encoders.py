@@ -148,7 +148,7 @@ class DenseMLP(Encoder):
         self.projection = self.make_projection()
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        x = observations.flatten(start_dim=1)
+        x = observations.reshape(len(observations), -1)
         for layer in self.layers:
             added = layer(x).relu()
             x = th.cat([x, added], dim=1) if self.dense else added
@@ -201,7 +201,8 @@ class MultiInputEncoder(Encoder):
     def _inputs(self, observations: TensorDict) -> list[th.Tensor]:
         inputs = [observations[key] for key in self.image_keys]
         if self.vector_keys:
-            inputs.append(th.cat([observations[key].flatten(start_dim=1) for key in self.vector_keys], dim=1))
+            # reshape() gives a scalar an axis, which flatten() does not.
+            inputs.append(th.cat([observations[key].reshape(len(observations[key]), -1) for key in self.vector_keys], dim=1))
         return inputs
 
     def trunk(self, observations: TensorDict) -> th.Tensor:  # type: ignore[override]

@@ -1,8 +1,9 @@
 """Policies of SACAux: actor, critic and momentum target around one encoder, which belongs to the critic."""
 
+import copy
 from collections.abc import Callable, Collection
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import torch as th
 from gymnasium import spaces
@@ -73,6 +74,15 @@ def map_images(obs: PyTorchObs, image_keys: Collection[str], function: Callable[
     return function(obs) if image_keys else obs
 
 
+def has_parts(features_extractor: BaseFeaturesExtractor) -> TypeGuard[Encoder]:
+    """
+    Whether an encoder is a trunk and a projection, one after the other, and nothing else: no ``forward`` of its own.
+
+    :param features_extractor: The encoder
+    """
+    return isinstance(features_extractor, Encoder) and type(features_extractor).forward is Encoder.forward
+
+
 def read_trunk(features_extractor: BaseFeaturesExtractor, obs: Any) -> th.Tensor:
     """
     What actor and critic both read of a shared encoder: all but its projection; all of an encoder that has none.
@@ -80,7 +90,7 @@ def read_trunk(features_extractor: BaseFeaturesExtractor, obs: Any) -> th.Tensor
     :param features_extractor: The encoder
     :param obs: Preprocessed observations (batch, ...)
     """
-    return features_extractor.trunk(obs) if isinstance(features_extractor, Encoder) else features_extractor(obs)
+    return features_extractor.trunk(obs) if has_parts(features_extractor) else features_extractor(obs)
 
 
 def full_precision(x: th.Tensor) -> th.Tensor:
@@ -164,7 +174,7 @@ class Actor(_CropsImages, SB3Actor):
         # An encoder that learns nothing, such as SB3's FlattenExtractor, is read as it is.
         learns = any(parameter.requires_grad for parameter in self.features_extractor.parameters())
         self.projection: nn.Module = nn.Identity()
-        if share_features_extractor and isinstance(self.features_extractor, Encoder):
+        if share_features_extractor and has_parts(self.features_extractor):
             self.projection = self.features_extractor.make_projection()
         elif share_features_extractor and learns:
             layers = nn.Linear(self.features_dim, self.features_dim), nn.LayerNorm(self.features_dim)
@@ -235,8 +245,7 @@ class Critic(_CropsImages, ContinuousCritic):
         :return: (batch, features_dim)
         """
         values = obs.values if isinstance(obs, Trunk) else self.trunk(obs).values
-        is_whole = not isinstance(self.features_extractor, Encoder)
-        return full_precision(values if is_whole else self.features_extractor.project(values))
+        return full_precision(self.features_extractor.project(values) if has_parts(self.features_extractor) else values)
 
     def q_values(self, latent: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
@@ -280,7 +289,7 @@ class SACAuxPolicy(SACPolicy):
     :param lr_schedule: Learning rate schedule
     :param net_arch: Hidden layers of actor and critic, two of 1024 by default (paper, tables 7 and 8)
     :param features_extractor_class: The encoder: a name of ``encoders.ENCODERS`` or a class
-    :param features_extractor_kwargs: Its keyword arguments
+    :param features_extractor_kwargs: Its keyword arguments; each encoder gets a copy of them
     :param share_features_extractor: True (default, CURL's pixel agent): the actor reads the critic's encoder
         detached, through a projection of its own. False: it has an encoder of its own, which the actor loss trains
     :param augmentation: What ``augment`` does to images: ``random_crop``, ``random_shift``, ``none``, or ``auto``:
@@ -323,12 +332,12 @@ class SACAuxPolicy(SACPolicy):
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
         encoder = encoder_class(features_extractor_class or self.default_encoder)
-        if issubclass(encoder, MultiInputEncoder) and not normalize_images:
+        is_class = isinstance(encoder, type)  # SB3 takes whatever makes one
+        if is_class and issubclass(encoder, MultiInputEncoder) and not normalize_images:
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
         # As SB3's NatureCNN: floats that nobody scales are mostly a mistake.
-        assert not issubclass(encoder, PixelEncoder) or is_image_space(
-            observation_space, normalized_image=not normalize_images
-        ), (
+        is_for_images = is_class and issubclass(encoder, PixelEncoder)
+        assert not is_for_images or is_image_space(observation_space, normalized_image=not normalize_images), (
             f"{encoder.__name__} is for images, not for {observation_space}. Images that are floats already, such as "
             "VecNormalize's, have to be channel first and need policy_kwargs=dict(normalize_images=False)"
         )
@@ -354,9 +363,14 @@ class SACAuxPolicy(SACPolicy):
                     network.apply(orthogonal_init)
         self.critic_target = self.make_critic()
         for network in (self.actor.latent_pi, *self.critic.q_networks, *self.critic_target.q_networks):
-            for module in network.modules():
-                if isinstance(module, nn.ReLU):
-                    module.inplace = True  # nothing needs what a linear layer gave: less memory to write
+            for layer in network.children():  # not those inside of an activation function of the user's
+                if type(layer) is nn.ReLU:
+                    layer.inplace = True  # nothing needs what a linear layer gave: less memory to write
+        if set(self.critic.parameters()) & set(self.critic_target.parameters()):
+            raise ValueError(
+                f"{self.features_extractor_class.__name__} gives critic and target critic the same parameters: each needs an "
+                "encoder of its own. A module that it is made of has to be one of features_extractor_kwargs, which are copied"
+            )
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.set_training_mode(False)
         self.critic_target.requires_grad_(False)
@@ -382,7 +396,8 @@ class SACAuxPolicy(SACPolicy):
         space = self.observation_space
         if self.crops:
             space = cropped_space(space, self.crop_size, not self.normalize_images)
-        return self.features_extractor_class(space, **self.features_extractor_kwargs)
+        # A network among them would else be one and the same in encoder and momentum encoder.
+        return self.features_extractor_class(space, **copy.deepcopy(self.features_extractor_kwargs))
 
     @property
     def crops(self) -> bool:
@@ -451,7 +466,10 @@ def cropped_space(space: spaces.Space, size: int, normalized_image: bool) -> spa
     :param normalized_image: As in :func:`image_spaces`
     """
     images = image_spaces(space, normalized_image)
-    cropped = {key: spaces.Box(0, 255, (box.shape[0], size, size), box.dtype) for key, box in images.items()}  # type: ignore[arg-type]
+    cropped = {
+        key: spaces.Box(box.low[:, :size, :size], box.high[:, :size, :size], dtype=box.dtype)  # type: ignore[arg-type]
+        for key, box in images.items()
+    }
     if isinstance(space, spaces.Dict):
         return spaces.Dict({**space.spaces, **cropped})
     return cropped.get("", space)

@@ -75,7 +75,8 @@ class SACAux(SAC):
     unless another source is named; what differs there between tasks has the value of most tasks.
 
     :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
-    :param env: The environment, or its registered name (those of DeepMind Control once ``sb3_aarl.envs`` is imported)
+    :param env: The environment, or its registered name (those of DeepMind Control once ``sb3_aarl.envs`` is imported: they
+        are for ``"MultiInputPolicy"``, while ``envs.make_dmc_env`` makes vectors or images of their observations)
     :param learning_rate: Of actor and critic, may be a schedule (1e-3; 2e-4 for Cheetah-Run)
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts
@@ -260,6 +261,11 @@ class SACAux(SAC):
         # Here rather than in the constructor: load() takes these arguments too, and replaces attributes by them.
         if self.aux_loss is not None and self.aux_loss != "auto":
             self.aux_loss = catalog.resolve(self.aux_loss)
+        if not issubclass(self.policy_class, SACAuxPolicy):
+            raise ValueError(
+                "policy must be MlpPolicy, CnnPolicy, MultiInputPolicy or derived from sb3_aarl.policies.SACAuxPolicy, "
+                f"not {self.policy_class}: SB3's have no momentum encoder"
+            )
         # What each argument is called, in case that one of them does not fit.
         counts = ("buffer_size", "batch_size", "policy_delay", "target_update_interval", "crop_size")
         for name in (*counts, "aux_batch_size", "predictor_width"):
@@ -341,7 +347,7 @@ class SACAux(SAC):
         assert self.n_steps == 1 or not isinstance(self.observation_space, spaces.Dict), (
             f"n_steps={self.n_steps}: n-step returns are not supported for Dict observation spaces"
         )
-        if self.env is not None:
+        if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
             self._frame_stack = detect_frame_stack(self.env)
         found = {} if self._frame_stack is None else {"frame_stack": self._frame_stack}
         n_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
@@ -704,11 +710,15 @@ class SACAux(SAC):
         return result
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        rollout = super().collect_rollouts(*args, **kwargs)
-        if not rollout.continue_training and isinstance(self.replay_buffer, WindowReplayBuffer) and self.replay_buffer.stacks:
-            # A callback stopped it before the last step was stored: that frame is missing in the stacks that would follow.
-            self._last_obs = None
-        return rollout
+        rollout = None
+        try:
+            rollout = super().collect_rollouts(*args, **kwargs)
+            return rollout
+        finally:
+            ended = rollout is not None and rollout.continue_training
+            if not ended and isinstance(self.replay_buffer, WindowReplayBuffer) and self.replay_buffer.stacks:
+                # Stopped before the last step was stored: that frame is missing in the stacks that would follow.
+                self._last_obs = None
 
     def learn(
         self: SelfSACAux,

@@ -914,6 +914,38 @@ def test_a_training_that_a_callback_stopped_goes_on(caplog: pytest.LogCaptureFix
         assert model.replay_buffer.size() == 26  # the step that stopped it is not stored, as in SB3
 
 
+@pytest.mark.parametrize("kind", ["state", "pixels"])
+def test_a_training_that_was_interrupted_goes_on(kind: str) -> None:
+    class Interrupt(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.n_calls == 27:
+                raise KeyboardInterrupt
+            return True
+
+    env: Any = make_env(kind, length=50)
+    model = make_model(kind, VecFrameStack(env, 3, channels_order="first") if kind == "pixels" else env)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(40, Interrupt())
+    before = model._n_updates
+    model.learn(20, reset_num_timesteps=False)
+    assert model._n_updates == before + 20 and model.replay_buffer.size() == 46
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_environments_that_somebody_else_stepped(normalized: bool) -> None:
+    env: Any = VecFrameStack(make_env("pixels", length=50), 3, channels_order="first")
+    model = make_model("pixels", VecNormalize(env, norm_obs=False) if normalized else env).learn(25)
+    env = model.get_env()
+    obs = env.reset()
+    for _ in range(5):
+        obs, *_ = env.step(model.predict(obs)[0])
+    with pytest.raises(ValueError, match=r"if somebody else stepped them since, .* call learn\(\) again"):
+        model.learn(20, reset_num_timesteps=False)
+    before = model.replay_buffer.size()
+    model.learn(20, reset_num_timesteps=False)
+    assert model.replay_buffer.size() == before + 20
+
+
 def test_other_envs_than_those_of_the_saved_model(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
     make_model(env=VecNormalize(make_env("state"))).learn(30).save(tmp_path / "model")
     loaded = SACAux.load(tmp_path / "model", env=VecNormalize(make_env("state", 2)), device="cpu")

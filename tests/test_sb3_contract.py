@@ -1,6 +1,9 @@
 """What SB3 promises for SAC holds for SACAux: spaces, images, vectorized environments, wrappers, callbacks, options."""
 
+from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -16,9 +19,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
+from stable_baselines3.sac.policies import CnnPolicy, SACPolicy
 from torch import nn
 
 from sb3_aarl import SACAux, catalog
+from sb3_aarl.encoders import DenseMLP
 
 FORWARD_DYNAMICS = "{s_t, a_t} -> {s_t+1}"
 EPISODE = 7
@@ -139,6 +144,7 @@ def assert_equal_parameters(first: SACAux, second: SACAux) -> None:
         spaces.MultiDiscrete([3, 4]),
         spaces.MultiBinary(4),
         spaces.MultiBinary((2, 3)),
+        spaces.Box(-1, 1, ()),
     ],
     ids=str,
 )
@@ -346,6 +352,24 @@ def test_n_step_returns() -> None:
         make_model(RandomEnv(MIXED), "MultiInputPolicy", n_steps=3)
 
 
+class Untold(DummyVecEnv):
+    """A VecEnv of a user's own, which does not say how its environments are wrapped."""
+
+    answer: list[bool] | None = None
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
+        if self.answer is None:
+            raise NotImplementedError
+        return self.answer
+
+
+@pytest.mark.parametrize("answer", [None, [], [True]])
+def test_environments_that_do_not_say_how_they_are_wrapped(answer: list[bool] | None) -> None:
+    env = Untold([RandomEnv])
+    env.answer = answer
+    assert_all_train(make_model(env))
+
+
 def test_optimize_memory_usage_changes_nothing() -> None:
     assert_equal_parameters(
         *(make_model(optimize_memory_usage=optimize, buffer_size=25).learn(40) for optimize in (False, True))
@@ -425,6 +449,128 @@ def test_users_features_extractor(share: bool) -> None:
     assert model._n_updates % model.target_update_interval == 0 and th.equal(norm.running_mean, target_norm.running_mean)
 
 
+class AroundNetwork(BaseFeaturesExtractor):
+    """An encoder around a network that comes as an argument."""
+
+    def __init__(self, observation_space: spaces.Space, network: nn.Module):
+        super().__init__(observation_space, 6)
+        self.network = network
+        self.last = nn.Linear(5, 6)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.last(self.network(observations))
+
+
+@pytest.mark.parametrize("share", [True, False])
+@pytest.mark.parametrize("frozen", [True, False])
+def test_a_network_among_the_arguments_is_copied_for_each_encoder(frozen: bool, share: bool) -> None:
+    network = nn.Sequential(nn.Linear(3, 5), nn.Tanh()).requires_grad_(not frozen)
+    policy_kwargs = {
+        "features_extractor_class": AroundNetwork,
+        "features_extractor_kwargs": {"network": network},
+        "share_features_extractor": share,
+    }
+    model = make_model(policy_kwargs=policy_kwargs)
+    copies = [getattr(model, name).features_extractor.network[0] for name in ("actor", "critic", "critic_target")]
+    assert len({id(copied) for copied in [network[0], *copies]}) == (3 if share else 4)
+    before = network[0].weight.detach().clone()
+    assert all(th.equal(copied.weight, before) for copied in copies)
+    moved = moved_by_training(model)
+    assert moved["encoder"] == [not frozen, not frozen, True, True]
+    assert th.equal(network[0].weight, before)
+    # The momentum encoder follows from where both began; an average of two equal numbers may round.
+    of_actor, online, target = ((copied.weight - before).norm().item() for copied in copies)
+    if frozen:
+        assert of_actor == online == 0 and target < 1e-5
+    else:
+        assert of_actor > 0 and 1e-4 * online < target < 0.5 * online
+
+
+THE_ONE = nn.Linear(3, 6)
+
+
+class AroundTheOne(AroundNetwork):
+    def __init__(self, observation_space: spaces.Space):
+        super().__init__(observation_space, THE_ONE)
+        self.last = nn.Linear(6, 6)
+
+
+def test_an_encoder_that_critic_and_target_would_share_is_refused() -> None:
+    with pytest.raises(ValueError, match="AroundTheOne gives critic and target critic the same parameters"):
+        make_model(policy_kwargs={"features_extractor_class": AroundTheOne})
+
+
+class Doubled(DenseMLP):
+    """One of the package's encoders, with a forward pass of its own."""
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return 2 * super().forward(observations)
+
+
+@pytest.mark.parametrize("share", [True, False])
+def test_an_encoder_derived_from_the_packages_own(share: bool) -> None:
+    extractor = {"features_extractor_class": Doubled, "features_extractor_kwargs": {"features_dim": 4, "width": 3}}
+    model = make_model(policy_kwargs={**extractor, "share_features_extractor": share})
+    assert_all_train(model)
+    observations = th.as_tensor(np.stack([VECTOR.sample() for _ in range(5)]))
+    encoder = model.critic.features_extractor
+    with th.no_grad():
+        expected = 2 * encoder.project(encoder.trunk(observations))
+        th.testing.assert_close(model.critic.encode(observations), expected)
+        read = model.actor.extract_features(observations, model.actor.features_extractor)
+        th.testing.assert_close(read, model.actor.projection(model.actor.features_extractor(observations)))
+    assert [type(layer) for layer in model.actor.projection.children()] == ([nn.Linear, nn.LayerNorm] if share else [])
+
+
+def test_a_features_extractor_need_not_be_a_class() -> None:
+    assert_all_train(make_model(policy_kwargs={"features_extractor_class": partial(UsersExtractor, width=4)}))
+
+
+@pytest.mark.parametrize("policy", [SACPolicy, CnnPolicy])
+def test_policies_of_sb3_are_refused(policy: type, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"policy must be MlpPolicy, .*, not <class '.*{policy.__name__}'>"):
+        make_model(policy=policy)
+    SAC("MlpPolicy", RandomEnv(), device="cpu").save(tmp_path / "model")
+    with pytest.raises(ValueError, match="policy must be MlpPolicy"):
+        SACAux.load(tmp_path / "model")
+
+
+class Skip(nn.Module):
+    """x + ReLU(x)"""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.relu = nn.ReLU()
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return x + self.relu(x)
+
+
+class Bent(Skip):
+    """ReLU(tanh(x)), whose backward pass needs what tanh gave."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return self.relu(th.tanh(x))
+
+
+@pytest.mark.parametrize(
+    ("activation", "function"),
+    [
+        (nn.ReLU, lambda x: x.clamp(min=0)),
+        (Skip, lambda x: x + x.clamp(min=0)),
+        (Bent, lambda x: x.tanh().clamp(min=0)),
+    ],
+)
+def test_activation_functions_of_a_users_own(activation: type[nn.Module], function: Callable[[th.Tensor], th.Tensor]) -> None:
+    model = make_model(policy_kwargs={"activation_fn": activation})
+    assert_all_train(model, 40)
+    for network in (*model.critic.q_networks, *model.critic_target.q_networks):
+        first, _, last = network
+        inputs = th.randn(9, first.in_features)
+        with th.no_grad():
+            th.testing.assert_close(network(inputs), last(function(first(inputs))))
+
+
 def test_sb3s_cnn_as_encoder() -> None:
     env = RandomEnv(image_space(3, 36, 36))
     kwargs = {"features_extractor_class": NatureCNN, "features_extractor_kwargs": {"features_dim": 8}}
@@ -467,6 +613,8 @@ def test_float_images_are_augmented_too(augmentation: str, size: int) -> None:
     env = RandomEnv(spaces.Box(0, 1, (1, 100, 100)))
     model = make_model(env, "CnnPolicy", kwargs, augmentation=augmentation, aux_loss="auto")
     assert model.aux_loss == catalog.load("aarl-pixel")
+    read = model.critic.features_extractor._observation_space
+    assert isinstance(read, spaces.Box) and read == spaces.Box(0, 1, (1, size, size))
     images = th.rand(4, 1, 100, 100)
     augmented = model.policy.augment(images)
     assert augmented.shape[2:] == (size, size) and th.equal(augmented, images) == (augmentation == "none")
