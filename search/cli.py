@@ -305,7 +305,7 @@ def live() -> Iterator[Callable[[RenderableType], None]]:
 def _stages_table(progress: "Progress") -> Table:
     togo = "?" if progress.seconds_to_go is None else str(timedelta(seconds=round(progress.seconds_to_go)))
     best = "-" if progress.best is None else f"{progress.best:.2f}"
-    table = Table("stage", "places", "done", "running", "failed", title=f"best {best}, {togo} to go")
+    table = Table("stage", "places", "done", "running", "failed", "died", title=f"best {best}, {togo} to go")
     for column in table.columns:
         column.justify = "right"
     for stage in progress.stages:

@@ -18,6 +18,7 @@ from typing import Any, Union, get_args, get_origin
 
 import gymnasium as gym
 import yaml
+from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.sac.policies import SACPolicy
 from torch.optim import Adam
@@ -333,9 +334,22 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
-)
+class _Dumper(yaml.SafeDumper):
+    """Writes what ``_Loader`` reads as it was: a text that looks like 1e-4 in quotes."""
+
+
+_FLOAT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
+for _class in (_Loader, _Dumper):
+    _class.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
+
+
+def dump(values: Mapping[str, Any]) -> str:
+    """
+    YAML that is read here as it was.
+
+    :param values: Plain values
+    """
+    return yaml.dump(dict(values), Dumper=_Dumper)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -547,6 +561,10 @@ def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str)
     ):
         if policy_kwargs.get(key) is not None:  # it stays as RL-Zoo reads it: a list is no tuple
             _mapping(policy_kwargs[key], hints, f"{where}: policy_kwargs.{key}", Path())
+    try:
+        get_device(checked.get("device", "auto"))
+    except RuntimeError:
+        raise ConfigError(f"{where}: device must be auto, cpu, cuda or cuda:N, not {checked['device']!r}") from None
     if checked.get("vec_env", "dummy") not in VEC_ENVS:
         raise ConfigError(f"{where}: vec_env must be one of {', '.join(VEC_ENVS)}, not {checked['vec_env']!r}")
     return checked

@@ -17,7 +17,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
 from search import grid, workers
-from search.config import SearchConfig, load_config
+from search.config import SearchConfig, dump, load_config
 from search.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts, update_plots
 from search.objective import CandidateFailed, DiskError, Objective, causes, check_study, disk_problem, make_pruner
 from search.pool import Pool, Unfit, WorkerError, uninterrupted
@@ -95,19 +95,22 @@ def keep_config(study: optuna.Study, config: SearchConfig) -> None:
 
     :param study: The study
     :param config: The search
-    :raises ValueError: when the study was to have more stages, for which others may wait
+    :raises ValueError: when the study was to have more stages, for which others may wait, or has candidates of another seed
     """
     hidden = {"path": None, "hyperparameters": f"{config.name}-hyperparameters.yml"}
     values = {item.name: hidden.get(item.name, getattr(config, item.name)) for item in fields(config)}
     texts = {
-        f"{config.name}.yml": yaml.safe_dump(_plain({key: value for key, value in values.items() if value is not None})),
+        f"{config.name}.yml": dump(_plain({key: value for key, value in values.items() if value is not None})),
         hidden["hyperparameters"]: config.hyperparameters.read_text(encoding="utf-8"),
     }
-    stored, stages = study.user_attrs.get(CONFIG_KEY), 0
+    stored, stages, seed = study.user_attrs.get(CONFIG_KEY), 0, config.seed
     with contextlib.suppress(yaml.YAMLError, LookupError, TypeError, ValueError):  # one of another kind is replaced
-        stages = int(yaml.safe_load((stored or {})[f"{config.name}.yml"])["stages"])
+        begun = yaml.safe_load((stored or {})[f"{config.name}.yml"])
+        stages, seed = int(begun["stages"]), int(begun["seed"])
     if stages > config.stages:
         raise ValueError(f"study {config.name!r} was begun with {stages} stages: it may get more, not {config.stages}")
+    if seed != config.seed and study.get_trials(deepcopy=False):
+        raise ValueError(f"study {config.name!r} was begun with seed={seed}, which it keeps: not {config.seed}")
     if stored != texts:
         study.set_user_attr(CONFIG_KEY, texts)
 

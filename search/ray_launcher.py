@@ -239,7 +239,10 @@ class RayPool:
             return room
         gpus = resources.get("GPU", 0)
         # Those that share a GPU must fit on it.
-        of_gpus = gpus // self.gpus_per_trial if self.gpus_per_trial > 1 else gpus * (1 // self.gpus_per_trial)
+        # Ray counts in such units, and 1 // 0.2 is 4 in floats.
+        unit = 10**DIGITS
+        one = round(self.gpus_per_trial * unit)
+        of_gpus = gpus * unit // one if self.gpus_per_trial > 1 else gpus * (unit // one)
         return min(room, int(of_gpus))
 
     def _complain(self, nodes: list[dict[str, float]]) -> None:

@@ -342,6 +342,9 @@ class AuxLossSampler(BaseGASampler):
         """
         with self._lock:
             self._refresh(study)
+            waiting = [n for n in self._register.open if self._register.trials[n].state == TrialState.WAITING]
+            if waiting and min(waiting) in self._register.places:
+                return True  # a copy of a trial whose worker died, which is next and brings its place
             # Before the first trial chose, the seed of the study may still be open.
             return not self._register.holders or self._nth_free(study, len(self._register.unplaced())) is not None
 
@@ -377,13 +380,18 @@ class AuxLossSampler(BaseGASampler):
             return params
         # Enqueued: what the user left open is drawn at random, so that a valid loss comes out if there is one.
         given = {**trial.params, **trial.system_attrs.get(FIXED_KEY, {})}
+        if "horizon" in given:
+            horizon = given["horizon"]
+            if not isinstance(horizon, (int, float, np.number)) or horizon not in range(1, self.max_horizon + 1):
+                return {}  # suggest_aux_loss refuses it
+            given["horizon"] = int(horizon)  # 7.0 of a table, as Optuna takes it
         rng = np.random.default_rng([claim["seed"], claim["stage"], claim["place"], claim["attempt"]])
         for _ in range(MAX_DRAWS):
             params = {
                 **space.loss_to_params(space.random_loss(rng, self.max_horizon, self.operators), self.operators),
                 **given,
             }
-            with contextlib.suppress(KeyError, ValueError):
+            with contextlib.suppress(KeyError, TypeError, ValueError):
                 return space.loss_to_params(space.params_to_loss(params), self.operators)
         return {}
 

@@ -8,7 +8,7 @@ import numpy as np
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
 
-from sb3_aarl.aux_loss import OPERATORS, AuxLoss, Token
+from sb3_aarl.aux_loss import LONGEST_HORIZON, OPERATORS, AuxLoss, Token
 
 MAX_HORIZON = 10  # paper, section 2.1
 Bits = tuple[bool, ...]
@@ -40,8 +40,11 @@ def token_names(horizon: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """
     :param horizon: Horizon of a loss
     :return: Names of the parameters of the source's bits, and of the target's
+    :raises ValueError: for what is no horizon
     """
-    tokens = [Token.of(index) for index in range(3 * horizon + 1)]
+    if horizon not in range(1, LONGEST_HORIZON + 1):
+        raise ValueError(f"a horizon is a whole number from 1 to {LONGEST_HORIZON}, not {horizon!r}")
+    tokens = [Token.of(index) for index in range(3 * int(horizon) + 1)]
     return tuple(f"source/{token}" for token in tokens), tuple(f"target/{token}" for token in tokens)
 
 
@@ -89,8 +92,9 @@ def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
     :raises KeyError: when parameters are missing
     :raises ValueError: when the loss is not valid
     """
-    source, target = (tuple(params[name] for name in names) for names in token_names(params["horizon"]))
-    return AuxLoss(params["horizon"], source, target, params.get("operator", "mse"), params.get("negatives", False))
+    horizon = params["horizon"]
+    source, target = (tuple(params[name] for name in names) for names in token_names(horizon))
+    return AuxLoss(int(horizon), source, target, params.get("operator", "mse"), params.get("negatives", False))
 
 
 def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
@@ -114,13 +118,19 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
     ):
         if searched != value:
             raise ValueError(f"the sampler searches with {name}={searched!r}, suggest_aux_loss asks for {name}={value!r}")
-    horizon = trial.suggest_int("horizon", 1, max_horizon)
-    if not 1 <= horizon <= longest:  # Optuna only warns of an enqueued one
-        raise optuna.TrialPruned(f"horizon must be between 1 and {longest}, not {horizon}")
-    params: dict[str, Any] = {"horizon": horizon}
-    for name, distribution in distributions(horizon, max_horizon, operators).items():
-        if isinstance(distribution, CategoricalDistribution):
-            params[name] = trial.suggest_categorical(name, distribution.choices)
+    name = "horizon"
+    params: dict[str, Any] = {}
+    try:
+        horizon = params[name] = trial.suggest_int(name, 1, max_horizon)
+        if not 1 <= horizon <= longest:  # Optuna only warns of an enqueued one
+            raise optuna.TrialPruned(f"horizon must be between 1 and {longest}, not {horizon}")
+        for name, distribution in distributions(horizon, max_horizon, operators).items():
+            if isinstance(distribution, CategoricalDistribution):
+                params[name] = trial.suggest_categorical(name, distribution.choices)
+    except (TypeError, ValueError) as error:
+        if name in getattr(trial, "_fixed_params", ()):  # enqueued: anything may be
+            raise optuna.TrialPruned(f"{name} was enqueued with a value that it cannot have: {error}") from None
+        raise
     try:
         return params_to_loss(params)
     except ValueError as error:

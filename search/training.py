@@ -199,12 +199,13 @@ def train_candidate(
         curve = store.finished_curve(checkpoints, keep_model)
     if curve is None:
         make = functools.partial(make_vec_env, make_env, env_kwargs={"env_id": environment, "env_kwargs": env_kwargs})
+        made = functools.partial(_made, environment)
         # From states a prediction takes as long as a step of an environment: one for all episodes. A picture takes much
         # longer than the prediction from it, and each environment that renders has tens of megabytes for it.
         n_eval, eval_cls = (min(n_envs, evaluation_episodes), vec_env_cls) if pixels else (evaluation_episodes, DummyVecEnv)
         with (
-            _closed(make(n_envs, seed=seed, vec_env_cls=vec_env_cls, wrapper_class=ResumableEnv)) as env,
-            _closed(make(n_eval, seed=0, vec_env_cls=eval_cls, wrapper_class=SingleEpisodes)) as eval_env,
+            _closed(made(make, n_envs, seed=seed, vec_env_cls=vec_env_cls, wrapper_class=ResumableEnv)) as env,
+            _closed(made(make, n_eval, seed=0, vec_env_cls=eval_cls, wrapper_class=SingleEpisodes)) as eval_env,
         ):
             try:
                 model, curve = store.load(env, settings.get("device", "auto")) if store is not None else (None, [])
@@ -218,7 +219,7 @@ def train_candidate(
                         raise _Unrelated(error) from error
 
                 if _repeat(curve, functools.partial(tell, anew=False)):
-                    model = model or SACAux(policy, env, **settings)
+                    model = model or made(SACAux, policy, env, **settings)
                     trained_with = str(model.aux_loss)
                     curve_callback = LearningCurveCallback(
                         eval_env,
@@ -329,6 +330,19 @@ def _closed(env: VecEnv) -> Iterator[VecEnv]:
     finally:
         with contextlib.suppress(EOFError, OSError):
             env.close()
+
+
+def _made(environment: str, make: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """What is made of settings. Where they do not fit, Gymnasium, SB3 and PyTorch have errors of all kinds."""
+    try:
+        return make(*args, **kwargs)
+    except (ValueError, OSError, EOFError, TrainingError):
+        raise
+    except Exception as error:
+        if memory_problem(error) or "CUDA error" in str(error):
+            raise
+        text = " ".join(str(error).split())
+        raise ConfigError(f"{environment} cannot be trained with these settings: {type(error).__name__}: {text}") from error
 
 
 def _was_killed(error: Exception, *envs: VecEnv) -> bool:

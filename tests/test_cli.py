@@ -22,12 +22,13 @@ from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
-from search import training
-from search.cli import ZOO, app, main
+from search import evolve, training
+from search.cli import ZOO, _stages_table, app, main
 from search.config import load_config
 from search.cross_validation import make_grid
 from search.grid import MAX_TRIES, Cell, Grid
 from search.provenance import read_about, write_about
+from search.sampler import StageProgress
 from search.space import distributions, loss_to_params
 from search.storage import open_storage
 
@@ -238,6 +239,14 @@ def test_a_storage_in_the_wrong_place_is_refused_without_its_password(
     said = capsys.readouterr()
     assert ended.value.code == 2
     assert "--storage" in said.err and "s3cret" not in said.out + said.err and len(said.err.splitlines()) == 1
+
+
+def test_every_number_of_a_stage_has_a_heading() -> None:
+    progress = evolve.Progress([StageProgress(1, 125, 80, 4, 3, 2), StageProgress(2, 100, 0, 0, 0, 0)], 7.0, None, None)
+    table = _stages_table(progress)
+    headings = [str(column.header) for column in table.columns]
+    assert headings == ["stage", "places", "done", "running", "failed", "died"]
+    assert [list(column.cells) for column in table.columns][5] == ["2", "0"]
 
 
 SEARCH = """

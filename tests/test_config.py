@@ -216,6 +216,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
         "overrides: .*unknown encoder 'dens_mlp'.*dense_mlp",
     ),
     ({"overrides": {"vec_env": "threads"}}, "vec_env must be one of dummy, subproc, not 'threads'"),
+    ({"overrides": {"device": "gpu"}}, "overrides: device must be auto, cpu, cuda or cuda:N, not 'gpu'"),
     ({"environment": 3}, "environment must be text, not 3"),
     ({"environment": "dm_control/cheetah-rum-v0"}, "cheetah-run"),
     ({"environment": "cheetah-run"}, "dm_control/cheetah-run-v0"),

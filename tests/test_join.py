@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from search import evolve, workers
 from search.cli import app
-from search.config import SearchConfig, load_config
+from search.config import Baseline, SearchConfig, load_config
 from search.sampler import AuxLossSampler
 from search.space import params_to_loss, suggest_aux_loss
 
@@ -59,7 +59,9 @@ def complete(where: str) -> list[tuple[int, int]]:
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_a_configuration_comes_back_from_a_study_as_it_was(path: Path, tmp_path: Path) -> None:
-    config = replace(load_config(path), stages=3, pruner="median")
+    # Texts that look like numbers, to one version of YAML or the other.
+    named = [Baseline(name, None, {"ent_coef": name}) for name in ("1e-4", "3E5", "1.5", "0x1")]
+    config = replace(load_config(path), stages=3, pruner="median", baselines=tuple(named))
     study = optuna.create_study(study_name=config.name)
     evolve.keep_config(study, config)
     stored = evolve.stored_config(study, tmp_path)
@@ -219,3 +221,14 @@ def test_a_study_never_gets_fewer_stages(config: Path, tmp_path: Path) -> None:
         evolve.keep_config(study, replace(load_config(config), stages=1))
     evolve.keep_config(study, replace(load_config(config), stages=3))
     assert evolve.stored_config(study, tmp_path).stages == 3
+
+
+def test_a_study_keeps_its_seed(config: Path, tmp_path: Path) -> None:
+    study = optuna.create_study(study_name="tiny")
+    for seed in (5, 6):  # no candidate is drawn yet
+        evolve.keep_config(study, replace(load_config(config), seed=seed))
+    study.ask()
+    evolve.keep_config(study, replace(load_config(config), seed=6, stages=3))
+    with pytest.raises(ValueError, match="begun with seed=6, which it keeps: not 5"):
+        evolve.keep_config(study, replace(load_config(config), seed=5, stages=3))
+    assert (evolve.stored_config(study, tmp_path).seed, evolve.stored_config(study, tmp_path).stages) == (6, 3)

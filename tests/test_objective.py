@@ -29,7 +29,7 @@ from sb3_aarl import AuxLoss, SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve
 from sb3_aarl.envs import make_dmc_env
 from search import evolve, training, workers
-from search.config import load_config
+from search.config import ConfigError, load_config
 from search.objective import CandidateFailed, DiskError, Objective, disk_problem, make_pruner, mean_curve
 from search.pool import Unfit, WorkerError
 from search.sampler import AuxLossSampler
@@ -715,6 +715,20 @@ def test_settings_that_no_candidate_can_work_with_stop_the_study(tmp_path: Path)
     study = make_study()
     with pytest.raises(ValueError, match="policy_delay"):
         study.optimize(make_objective(tmp_path, overrides={"policy_delay": 0}), n_trials=1, catch=CandidateFailed)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"policy_kwargs": {"net_arch": {"pi": [8]}}}, "AssertionError: .*qf"),
+        ({"policy_kwargs": {"net_arch": [-5]}}, "RuntimeError: .*negative dimension"),
+    ],
+    ids=str,
+)
+def test_settings_that_pytorch_and_sb3_refuse_are_one_line(tmp_path: Path, overrides: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=f"{ENV} cannot be trained with these settings: {message}") as error:
+        make_study().optimize(make_objective(tmp_path, overrides=overrides), n_trials=1, catch=CandidateFailed)
+    assert "\n" not in str(error.value)
 
 
 def test_an_invalid_candidate_costs_nothing(tmp_path: Path) -> None:

@@ -791,7 +791,7 @@ def test_an_enqueued_loss_that_is_invalid_or_fails_costs_no_place_and_no_candida
     assert issued(study) == issued(run(make_study()))
 
 
-def heartbeat_study(monkeypatch: pytest.MonkeyPatch) -> tuple[optuna.Study, Callable[[optuna.Trial], None]]:
+def heartbeat_study(monkeypatch: pytest.MonkeyPatch, **settings: Any) -> tuple[optuna.Study, Callable[[optuna.Trial], None]]:
     """A study with heartbeats, and how the heart of a trial stops."""
     with pytest.warns(optuna.exceptions.ExperimentalWarning):
         storage = RDBStorage(
@@ -800,7 +800,7 @@ def heartbeat_study(monkeypatch: pytest.MonkeyPatch) -> tuple[optuna.Study, Call
             grace_period=120,
             heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(),
         )
-    study = make_study(storage=storage, n_random=2, n_prior=0, n_stages=2)
+    study = make_study(storage=storage, **{"n_random": 2, "n_prior": 0, "n_stages": 2, **settings})
 
     def stop(trial: optuna.Trial) -> None:
         monkeypatch.setattr(storage, "_get_stale_trial_ids", lambda study_id: [trial._trial_id])
@@ -826,6 +826,17 @@ def test_a_copy_of_a_trial_whose_heart_stopped_keeps_its_place(monkeypatch: pyte
     third = study.ask()
     assert place_of(study.trials[third.number]) == (1, 1)
     assert study.trials[1].state == TrialState.RUNNING
+
+
+@pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
+def test_a_copy_brings_a_place_where_there_is_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    study, stop = heartbeat_study(monkeypatch, n_random=1, random=0.0, replacement=0.7)
+    trial = study.ask()
+    assert isinstance(study.sampler, AuxLossSampler) and not study.sampler.has_place(study)
+    stop(trial)
+    assert study.sampler.has_place(study)
+    assert ask_for_place(study) == (1, 0)
+    assert not study.sampler.has_place(study)
 
 
 @pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")

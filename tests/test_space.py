@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from optuna.distributions import CategoricalDistribution, IntDistribution
-from optuna.samplers import RandomSampler, TPESampler
+from optuna.samplers import BaseSampler, RandomSampler, TPESampler
 from optuna.trial import FixedTrial, TrialState
 from scipy.stats import binomtest, chisquare
 
@@ -184,6 +184,43 @@ def test_an_enqueued_horizon_outside_of_the_space_is_pruned(horizon: int) -> Non
     with pytest.warns(UserWarning, match="out of range"):
         study.optimize(lambda trial: suggest_aux_loss(trial, 3).horizon, n_trials=1)
     assert study.trials[0].state == TrialState.PRUNED
+
+
+@pytest.mark.parametrize("sampler", [RandomSampler(seed=0), None], ids=["random", "evolution"])
+@pytest.mark.parametrize(
+    ("enqueued", "name"),
+    [
+        ({"horizon": "two"}, "horizon"),
+        ({"horizon": 10**9}, "horizon"),
+        ({"horizon": 2, "source/s_t": "yes"}, "source/s_t"),
+        ({"horizon": 1, "operator": "l1"}, "operator"),
+    ],
+    ids=str,
+)
+@pytest.mark.filterwarnings("ignore:Fixed parameter")
+def test_an_enqueued_value_that_a_parameter_cannot_have_is_pruned(
+    sampler: BaseSampler | None, enqueued: dict[str, Any], name: str
+) -> None:
+    sampler = sampler or AuxLossSampler(max_horizon=3, operators=["mse", "inner"], seed=0)
+    study = optuna.create_study(sampler=sampler)
+    study.enqueue_trial(enqueued)
+    study.enqueue_trial({"horizon": 2.0, "source/s_t": True, "target/r_t": True})  # as a table has it
+    reasons = []
+
+    def objective(trial: optuna.Trial) -> float:
+        try:
+            return suggest_aux_loss(trial, 3, ["mse", "inner"]).horizon
+        except optuna.TrialPruned as pruned:
+            reasons.append(str(pruned))
+            raise
+
+    study.optimize(objective, n_trials=2)
+    assert [trial.state for trial in study.trials] == [TrialState.PRUNED, TrialState.COMPLETE]
+    assert len(reasons) == 1 and name in reasons[0]
+    assert study.trials[1].value == study.trials[1].params["horizon"] == 2
+    if isinstance(sampler, AuxLossSampler):
+        # It is not another try of the first, and the first costs no place.
+        assert [study.trials[i].system_attrs[PLACE_KEY]["place"] for i in range(2)] == [0, 0]
 
 
 @pytest.mark.parametrize(("operators", "culprit"), [(("mse", "l1"), "l1"), ("mse", "mse"), ((), r"\(\)")])
