@@ -222,8 +222,24 @@ def read_curve(path: str | Path) -> list[Evaluation]:
     Read what :func:`write_curve` wrote.
 
     :param path: The file
+    :raises ValueError: naming the line that is not what was written
     """
+    curve: list[Evaluation] = []
     with Path(path).open(newline="", encoding="utf-8") as file:
-        types = (int, float, float, int, float)
-        rows = list(csv.reader(file))[1:]
-        return [Evaluation(*(convert(cell) for convert, cell in zip(types, row, strict=True))) for row in rows]
+        for number, row in enumerate(csv.reader(file), start=1):
+            if number == 1:
+                if tuple(row) != Evaluation._fields:
+                    raise ValueError(f"{path} has {','.join(row)!r} in its first line, not {','.join(Evaluation._fields)!r}")
+                continue
+            types = (int, float, float, int, float)
+            try:
+                evaluation = Evaluation(*(convert(cell) for convert, cell in zip(types, row, strict=True)))
+            except ValueError:
+                raise ValueError(f"line {number} of {path} is no evaluation: {','.join(row)!r}") from None
+            if curve and evaluation.environment_steps <= curve[-1].environment_steps:
+                raise ValueError(
+                    f"line {number} of {path} is of {evaluation.environment_steps} environment steps, the one before of "
+                    f"{curve[-1].environment_steps}"
+                )
+            curve.append(evaluation)
+    return curve

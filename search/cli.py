@@ -29,11 +29,13 @@ if TYPE_CHECKING:
     from search.evolve import Launch, Progress
     from search.grid import Cell, Runs
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__.partition("\n")[0])
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
 
 YAML = (".yml", ".yaml")
+# What training alone does without, and commands import when they are called.
+OF_SEARCH = ("grpc", "joblib", "optuna", "optuna_dashboard", "plotly", "psutil", "sklearn", "threadpoolctl")
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 
 
@@ -68,6 +70,8 @@ def _one_line(error: Exception) -> str | None:
     line = without_password(" ".join(str(error).split()))
     if isinstance(error, (ValueError, OSError, TrainingError)):
         return line
+    if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in OF_SEARCH:
+        return f"{line}: pip install 'sb3-aarl[search]'"
     if "search.pool" in sys.modules:  # else it is not of Optuna, which a training alone does without
         from optuna.exceptions import StorageInternalError
 

@@ -1,6 +1,7 @@
 """Pictures of a study, as pure functions of its trials: plotly for the dashboard and the report, matplotlib for files."""
 
 import io
+import math
 import textwrap
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,7 +32,7 @@ BLUE, ORANGE, GREY = "#1f4e79", "#c55a11", "#444444"
 COLOURS = (BLUE, ORANGE, "#000000", "#7f7f7f", "#6aa7d6")
 # The same in matplotlib's words.
 LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
-SYMBOLS = ("o", "s", "D", "^", "P")
+SYMBOLS = ("o", "s", "D", "^", "P", "X", "v")
 # Histograms lie on top of each other: the first is filled, the others are hatched and outlined.
 HISTOGRAMS: tuple[dict[str, Any], ...] = (
     {"facecolor": "#d0d0d0", "edgecolor": "#7f7f7f", "linewidth": 1.0},
@@ -363,6 +364,7 @@ def learning_curves_plot(curves: pd.DataFrame, smooth: int = 1) -> Figure:
             spread = points["over_seeds"] if n_seeds > 1 else points["episodes"]
             colour = COLOURS[position % len(COLOURS)]
             every = max(1, len(points) // 8)
+            # Five lines and seven symbols: no two of 35 variants look alike.
             look = {"ls": LINES[position % len(LINES)], "marker": SYMBOLS[position % len(SYMBOLS)], "markevery": every}
             axes.plot(points.index, points["mean"], color=colour, lw=1.6, ms=4.5, label=str(variant), **look)
             axes.fill_between(
@@ -410,6 +412,7 @@ def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
             entries.setdefault(label, handle)
     # As many beside each other as fit the width, in inches.
     columns = max(1, int(figure.get_figwidth() / (0.7 + 0.08 * max(map(len, entries), default=0))))
+    figure.set_figheight(figure.get_figheight() + 0.22 * (math.ceil(len(entries) / columns) - 1))
     handles = list(entries.values())
     figure.legend(handles, list(entries), loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     # A $ in the name of a study or a file is no formula.
@@ -451,7 +454,8 @@ def _seeds(curves: pd.DataFrame) -> str:
     words = {variant: "1 seed (shade: episodes)" if n == 1 else f"{n} seeds" for variant, n in counts.items()}
     if counts.nunique() == 1:
         return next(iter(words.values()))
-    return textwrap.fill(", ".join(f"{variant}: {word}" for variant, word in words.items()), 45)
+    text = textwrap.fill(", ".join(f"{variant}: {word}" for variant, word in words.items()), 45)
+    return text if text.count("\n") < 3 else f"{counts.min()} to {counts.max()} seeds"
 
 
 def _step_axis(axes: Axes) -> None:

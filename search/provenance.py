@@ -28,7 +28,8 @@ PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "
 def commit() -> str:
     """
     The commit of this checkout, with ``+changes.`` and a hash of them if files differ from it; the version where there is
-    no checkout. It is looked up once: a process keeps the code that it has begun with, whatever is checked out later.
+    no checkout, or an installation that lies in somebody else's. It is looked up once: a process keeps the code that it has
+    begun with, whatever is checked out later.
     """
     root = Path(__file__).parent.parent
 
@@ -36,6 +37,8 @@ def commit() -> str:
         return subprocess.run(["git", *arguments], cwd=root, capture_output=True, check=True).stdout.strip()
 
     try:
+        if not root.samefile(os.fsdecode(git("rev-parse", "--show-toplevel"))):
+            return metadata.version("sb3-aarl")
         changes = git("diff", "--no-ext-diff", "HEAD")
         digest = f"+changes.{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
         return git("rev-parse", "--short=12", "HEAD").decode() + digest

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from functools import cache, partial
-from itertools import chain
+from itertools import chain, permutations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,8 +88,8 @@ def read_runs(folder: Path) -> pd.DataFrame:
     """
     What a benchmark's folder has: one row for each checkpoint of each run that was asked for, with ``variant``,
     ``environment``, ``seed``, ``checkpoint`` (environment steps), ``mean`` (return; NaN if it is missing), ``reason`` (why it
-    is missing, else empty), ``commit`` and ``versions`` (of all sessions that trained it), and the ``program`` if it was not
-    ``aarl benchmark``.
+    is missing, else empty), ``commit`` and ``versions`` (of all sessions that trained it), the ``program`` if it was not
+    ``aarl benchmark``, and ``episodes`` (of an evaluation; 0 if that is not known).
 
     :param folder: Folder of a benchmark; runs that were copied there from another machine count too
     :raises ValueError: when there are none, when one cannot be read, and as :func:`search.benchmark.read_abouts` does
@@ -109,10 +109,10 @@ def read_runs(folder: Path) -> pd.DataFrame:
             raise ValueError(f"{path} is not what a benchmark leaves: {ABOUT} cannot be read")
         run = (path.parent.parent.name, of_task[task]["environment"], int(seed))
         reason = f"its {ABOUT} cannot be read"
-        rows += [(*run, checkpoint, math.nan, reason, "", "", "") for checkpoint in of_task[task]["checkpoints"]]
+        rows += [(*run, checkpoint, math.nan, reason, "", "", "", 0) for checkpoint in of_task[task]["checkpoints"]]
     if not rows:
         raise ValueError(f"{folder} has no runs of a benchmark")
-    columns = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions", "program"]
+    columns = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions", "program", "episodes"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -134,7 +134,8 @@ def _points(path: Path, about: dict[str, Any]) -> list[tuple[Any, ...]]:
             begun = f"unfinished, evaluated up to {max(points, default=0):,}" if about["sessions"] else "not begun"
             reason = about.get("failed", begun)
         run = (about["variant"], about["environment"], about["seed"])
-        rows.append((*run, checkpoint, math.nan if reason else mean, reason, commits, versions, about.get("program", "")))
+        how = (commits, versions, about.get("program", ""), about.get("evaluation_episodes", 0))
+        rows.append((*run, checkpoint, math.nan if reason else mean, reason, *how))
     return rows
 
 
@@ -238,13 +239,15 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
 
     :param runs: As :func:`read_runs` gives them
     :param n_resamples: Resamples of the bootstrap
-    :return: One row for each ``checkpoint``, ``tasks`` (of which scale) and ``variant``: ``n_tasks``, ``asked``, ``runs`` that
-        count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has one run only), and the runs ``left_out``
+    :return: One row for each ``checkpoint``, ``tasks`` (of which scale; a single task's name) and ``variant``: ``n_tasks``,
+        ``asked``, ``runs`` that count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has one run only),
+        and the runs ``left_out``
     """
     rows = []
     scale = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
     for (checkpoint, tasks), of_scale in runs.groupby(["checkpoint", scale], sort=False):
         common, scores = _scores(of_scale)
+        tasks = task_name(common[0]) if len(common) == 1 else tasks
         of_common = of_scale[of_scale["environment"].isin(common)]
         for variant in scores:
             asked = of_common[of_common["variant"] == variant]
@@ -261,7 +264,7 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
 def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
     """
     Probability that a run of one variant is better than one of another on the same task, a tie being half, as the mean over
-    all tasks that all of them have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap.
+    all tasks that both have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap.
 
     :param runs: As :func:`read_runs` gives them
     :param n_resamples: Resamples of the bootstrap
@@ -269,12 +272,13 @@ def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFra
     """
     rows = []
     for checkpoint, of_checkpoint in runs.groupby("checkpoint"):
-        common, scores = _scores(of_checkpoint)
-        for variant, samples in scores.items():
-            for over, others in scores.items():
-                if variant != over and common:
-                    interval = _interval([*samples, *others], _improvement, n_resamples)
-                    rows.append((checkpoint, variant, over, len(common), _improvement(*samples, *others), *interval))
+        there = dict.fromkeys(of_checkpoint.dropna(subset="mean")["variant"])
+        for variant, over in permutations(there, 2):
+            common, scores = _scores(of_checkpoint[of_checkpoint["variant"].isin([variant, over])])
+            if common:
+                samples = [*scores[variant], *scores[over]]
+                interval = _interval(samples, _improvement, n_resamples)
+                rows.append((checkpoint, variant, over, len(common), _improvement(*samples), *interval))
     return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high"])
 
 
@@ -345,8 +349,8 @@ def commits(runs: pd.DataFrame) -> dict[str, int]:
 
 def mixed(runs: pd.DataFrame) -> list[str]:
     """
-    A line if runs were trained with several commits or versions, as :func:`commits` counts them, and one for each program
-    that is not ``aarl benchmark``.
+    A line if runs were trained with several commits or versions, as :func:`commits` counts them, one for each program that
+    is not ``aarl benchmark``, and one if evaluations are of different numbers of episodes.
 
     :param runs: As :func:`read_runs` gives them
     """
@@ -355,6 +359,10 @@ def mixed(runs: pd.DataFrame) -> list[str]:
     lines = [f"Runs of several commits or versions: {of_each}"] if len(counts) > 1 else []
     for program, of_program in runs[runs["program"] != ""].groupby("program"):
         lines.append(f"Trained by {program}: {', '.join(dict.fromkeys(of_program['variant']))}")
+    episodes = runs[runs["episodes"] > 0].drop_duplicates(["variant", "episodes"])
+    if episodes["episodes"].nunique() > 1:
+        of_each = ", ".join(f"{row['variant']} {row['episodes']}" for row in episodes.to_dict("records"))
+        lines.append(f"Evaluations are means of different numbers of episodes: {of_each}")
     return lines
 
 
@@ -461,6 +469,15 @@ def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, b
         )
     if iqm["left_out"].any():
         lines.append("Interquartile means leave out the seeds that a variant has on some of the tasks only.")
+    for checkpoint, part in comparison[comparison["environment"] != NORMALIZED].groupby("checkpoint"):
+        there = part[part["runs"] > 0]
+        n_variants = there.groupby("environment", sort=False)["variant"].nunique()
+        some = [task_name(str(name)) for name in n_variants[n_variants < there["variant"].nunique()].index]
+        if some:
+            lines.append(
+                f"At {_steps(checkpoint)} not every variant has runs on {', '.join(some)}: interquartile means leave that "
+                "out, and each probability is over the tasks that both variants have runs on."
+            )
     if (better["probability"].isin([0, 1]) & (better["low"] == better["high"])).any():
         lines.append(
             "An interval without width says only that no run of one variant is better than any of the other: resampled runs "

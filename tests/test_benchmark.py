@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -175,6 +176,10 @@ def test_two_sets_of_changes_are_two_commits(folder: Path, monkeypatch: pytest.M
     clean, one, two, again = commits
     assert re.fullmatch("[0-9a-f]{12}", clean) and one == again != two
     assert all(re.fullmatch(rf"{clean}\+changes\.[0-9a-f]{{8}}", commit) for commit in (one, two))
+    # An installation in a checkout of somebody else's, as that of a virtual environment.
+    (folder / "venv" / "search").mkdir(parents=True)
+    monkeypatch.setattr(provenance, "__file__", str(folder / "venv" / "search" / "provenance.py"))
+    assert look() == metadata.version("sb3-aarl")
     # A process keeps the code that it has begun with, whatever is checked out later.
     assert provenance.provenance()["commit"] == of_this_process != again
 

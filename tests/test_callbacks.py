@@ -1,6 +1,7 @@
 """Learning curves: evaluated exactly where they should be, repeatable, and without an influence on training."""
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -220,7 +221,10 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 evaluations = st.builds(Evaluation, st.integers(1, 10**9), finite, finite, st.integers(1, 100), finite)
 
 
-@given(st.lists(evaluations, max_size=5), st.lists(evaluations, max_size=5))
+curves = st.lists(evaluations, max_size=5, unique_by=lambda evaluation: evaluation.environment_steps).map(sorted)
+
+
+@given(curves, curves)
 @settings(max_examples=50, deadline=None)
 def test_a_curve_is_read_as_it_was_written(
     tmp_path_factory: pytest.TempPathFactory, before: list[Evaluation], curve: list[Evaluation]
@@ -230,6 +234,26 @@ def test_a_curve_is_read_as_it_was_written(
     write_curve(path, curve)
     assert read_curve(path) == curve
     assert [file.name for file in path.parent.iterdir()] == ["curve.csv"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda lines: lines[1:], r"has '20000,.*' in its first line, not 'environment_steps,"),
+        (lambda lines: [*lines, lines[-1]], "line 4 of .* is of 40000 environment steps, the one before of 40000"),
+        (lambda lines: [*lines, lines[1]], "line 4 of .* is of 20000 environment steps, the one before of 40000"),
+        (lambda lines: [*lines[:-1], lines[-1][:9]], "line 3 of .* is no evaluation: '40000,2.5'"),
+        (lambda lines: [*lines, "60000,many,1,10,3"], "line 4 of .* is no evaluation: '60000,many,"),
+    ],
+)
+def test_a_damaged_curve_is_refused_with_the_line(
+    tmp_path: Path, change: Callable[[list[str]], list[str]], message: str
+) -> None:
+    path = tmp_path / "curve.csv"
+    write_curve(path, [Evaluation(20_000, 1.5, 0.5, 10, 3.0), Evaluation(40_000, 2.5, 0.5, 10, 6.0)])
+    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+    with pytest.raises(ValueError, match=message):
+        read_curve(path)
 
 
 def test_the_file_has_every_evaluation_at_once(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import math
+import warnings
 from collections import defaultdict
 
 import matplotlib.image
@@ -345,6 +346,21 @@ def test_learning_curves_are_means_and_deviations_over_seeds(curves):
     assert figure.axes[order.index("walker")].get_title() == "walker\n4 seeds"
     assert figure.axes[0].get_ylabel() == "Return (mean ± std)" and "aarl" in legend_of(figure)
     check_drawing(figure)
+
+
+def test_many_variants_are_told_apart_and_leave_room_for_the_curves(curves):
+    one = curves.query("env == 'walker' and variant == 'aarl'")
+    names = [f"a_variant_with_a_long_name_{number}" for number in range(14)]
+    many = pd.concat([one[one["seed"] < 1 + number % 3].assign(variant=name) for number, name in enumerate(names)])
+    figure = learning_curves_plot(many)
+    (axes,) = figure.axes
+    # In grey too; of dashes of one's own get_linestyle() says "--" only.
+    assert len({(str(line._unscaled_dash_pattern), line.get_marker()) for line in axes.lines}) == 14
+    assert axes.get_title() == "walker\n1 to 3 seeds"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # matplotlib's, that nothing is left of the axes
+        check_drawing(figure)
+    assert axes.get_window_extent().height > 150
 
 
 def test_smoothing_is_a_centred_mean_of_each_run(curves):

@@ -236,14 +236,48 @@ def test_statistics_are_over_tasks_of_one_scale_that_all_variants_have(tmp_path:
     runs = table.read_runs(tmp_path)
     iqm = table.interquartile_means(runs).set_index(["tasks", "variant"])["iqm"]
     assert iqm.to_dict() == {
-        ("DeepMind Control", "a"): 1.5,
-        ("DeepMind Control", "b"): 7.0,
+        ("cheetah-run", "a"): 1.5,
+        ("cheetah-run", "b"): 7.0,
         ("Pendulum-v1", "a"): -150.0,
         ("Pendulum-v1", "b"): -500.0,
     }
     better = table.improvements(runs).set_index(["variant", "over"])
     assert better.loc[("a", "b"), "probability"] == pytest.approx(np.mean([0.0, (0.5 + 1 + 0 + 1) / 4]))
     assert better.loc[("a", "b"), "n_tasks"] == 2
+    shown = runner.invoke(app, ["table", str(tmp_path)]).stdout
+    line = "At 100K not every variant has runs on walker-walk: interquartile means leave that out"
+    assert " ".join(shown.split()).count(line) == 1
+
+
+def test_each_probability_is_over_the_tasks_of_its_two_variants(tmp_path: Path) -> None:
+    scores = {
+        ("a", CHEETAH): np.array([1.0, 2.0]),
+        ("b", CHEETAH): np.array([0.0, 9.0]),
+        ("a", WALKER): np.array([5.0, 6.0]),
+        ("b", WALKER): np.array([7.0, 8.0]),
+        ("c", WALKER): np.array([5.5, 5.5]),
+        ("d", "Pendulum-v1"): np.array([-5.0]),  # with nobody in common
+    }
+    plant_scores(tmp_path, scores)
+    better = table.improvements(table.read_runs(tmp_path)).set_index(["variant", "over"])
+    assert better["probability"].to_dict() == {
+        ("a", "b"): pytest.approx(0.25),
+        ("b", "a"): pytest.approx(0.75),
+        ("a", "c"): pytest.approx(0.5),
+        ("c", "a"): pytest.approx(0.5),
+        ("b", "c"): 1.0,
+        ("c", "b"): 0.0,
+    }
+    assert better["n_tasks"].to_dict() == {pair: 2 if "c" not in pair else 1 for pair in better.index}
+
+
+def test_numbers_of_episodes_that_differ_are_named(tmp_path: Path) -> None:
+    plant(tmp_path, Cell("a", CHEETAH, 0), {100_000: 1.0}, evaluation_episodes=10)
+    plant(tmp_path, Cell("b", CHEETAH, 0), {100_000: 1.0}, evaluation_episodes=10)
+    assert table.mixed(table.read_runs(tmp_path)) == []
+    plant(tmp_path, Cell("c", CHEETAH, 0), {100_000: 1.0}, evaluation_episodes=3)
+    line = "Evaluations are means of different numbers of episodes: a 10, b 10, c 3"
+    assert table.mixed(table.read_runs(tmp_path)) == [line]
 
 
 def test_every_task_weighs_the_same_in_an_interquartile_mean(tmp_path: Path) -> None:
@@ -443,7 +477,7 @@ def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) 
     shown = runner.invoke(app, ["table", str(tmp_path), *options])
     assert shown.exit_code == 0, shown.stderr
     rows = [[cell.strip() for cell in line.strip("│┃┡┩").split("│")] for line in shown.stdout.splitlines() if "│" in line]
-    (cheetah,) = (row for row in rows if row[0] == "cheetah-run")
+    (cheetah,) = (row for row in rows if row[0] == "cheetah-run" and "±" in row[1])
     a, b = (matrix[:, 2] for matrix in planted_matrices().values())
     own = [f"{scores.mean():.0f} ± {scores.std(ddof=1):.0f}" for scores in (a, b)]
     assert cheetah[1:] == ["435 ± 7 ▼", "472 ± 30", "190 ± 1", "190 ± 32", *own]
