@@ -31,6 +31,16 @@ def orthogonal_init(module: nn.Module) -> None:
         nn.init.zeros_(module.bias)
 
 
+def flat(observations: th.Tensor) -> th.Tensor:
+    """
+    Observations as vectors, scalars too.
+
+    :param observations: (batch, ...)
+    :return: (batch, numbers of an observation)
+    """
+    return observations.unsqueeze(-1).flatten(start_dim=1)
+
+
 class Encoder(BaseFeaturesExtractor, ABC):
     """
     An encoder in two parts: a trunk, and a projection (linear, layer norm) from it to the latent state.
@@ -148,7 +158,7 @@ class DenseMLP(Encoder):
         self.projection = self.make_projection()
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        x = observations.reshape(len(observations), -1)
+        x = flat(observations)
         for layer in self.layers:
             added = layer(x).relu()
             x = th.cat([x, added], dim=1) if self.dense else added
@@ -201,8 +211,7 @@ class MultiInputEncoder(Encoder):
     def _inputs(self, observations: TensorDict) -> list[th.Tensor]:
         inputs = [observations[key] for key in self.image_keys]
         if self.vector_keys:
-            # reshape() gives a scalar an axis, which flatten() does not.
-            inputs.append(th.cat([observations[key].reshape(len(observations[key]), -1) for key in self.vector_keys], dim=1))
+            inputs.append(th.cat([flat(observations[key]) for key in self.vector_keys], dim=1))
         return inputs
 
     def trunk(self, observations: TensorDict) -> th.Tensor:  # type: ignore[override]

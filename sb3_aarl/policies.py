@@ -289,7 +289,7 @@ class SACAuxPolicy(SACPolicy):
     :param lr_schedule: Learning rate schedule
     :param net_arch: Hidden layers of actor and critic, two of 1024 by default (paper, tables 7 and 8)
     :param features_extractor_class: The encoder: a name of ``encoders.ENCODERS`` or a class
-    :param features_extractor_kwargs: Its keyword arguments; each encoder gets a copy of them
+    :param features_extractor_kwargs: Its keyword arguments; of a network among them each encoder gets a copy
     :param share_features_extractor: True (default, CURL's pixel agent): the actor reads the critic's encoder
         detached, through a projection of its own. False: it has an encoder of its own, which the actor loss trains
     :param augmentation: What ``augment`` does to images: ``random_crop``, ``random_shift``, ``none``, or ``auto``:
@@ -366,10 +366,12 @@ class SACAuxPolicy(SACPolicy):
             for layer in network.children():  # not those inside of an activation function of the user's
                 if type(layer) is nn.ReLU:
                     layer.inplace = True  # nothing needs what a linear layer gave: less memory to write
-        if set(self.critic.parameters()) & set(self.critic_target.parameters()):
+        shared_with_target = set(self.critic.parameters()) & set(self.critic_target.parameters())
+        if any(parameter.requires_grad for parameter in shared_with_target):  # those of a frozen network never differ
+            name = getattr(self.features_extractor_class, "__name__", self.features_extractor_class)
             raise ValueError(
-                f"{self.features_extractor_class.__name__} gives critic and target critic the same parameters: each needs an "
-                "encoder of its own. A module that it is made of has to be one of features_extractor_kwargs, which are copied"
+                f"{name} gives critic and target critic the same parameters: each needs an encoder of its own. A network that "
+                "it is made of has to be one of features_extractor_kwargs, of which each encoder gets a copy"
             )
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.set_training_mode(False)
@@ -396,8 +398,16 @@ class SACAuxPolicy(SACPolicy):
         space = self.observation_space
         if self.crops:
             space = cropped_space(space, self.crop_size, not self.normalize_images)
-        # A network among them would else be one and the same in encoder and momentum encoder.
-        return self.features_extractor_class(space, **copy.deepcopy(self.features_extractor_kwargs))
+        kwargs = dict(self.features_extractor_kwargs)
+        # A network would else be one and the same in encoder and momentum encoder.
+        for name, network in kwargs.items():
+            if isinstance(network, nn.Module):
+                try:
+                    kwargs[name] = copy.deepcopy(network)
+                except Exception as error:  # such as that of a network with weight_norm
+                    problem = f"features_extractor_kwargs[{name!r}] cannot be copied, and each encoder needs one of its own"
+                    raise ValueError(f"{problem}: {error}") from error
+        return self.features_extractor_class(space, **kwargs)
 
     @property
     def crops(self) -> bool:

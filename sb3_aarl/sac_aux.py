@@ -851,7 +851,9 @@ class SACAux(SAC):
 @th.no_grad()
 def _moving_average(averages: Iterable[th.Tensor], parameters: Iterable[th.Tensor], tau: float) -> None:
     """SB3's ``polyak_update``, to the bit, with two kernels for all parameters together where there is a GPU."""
-    moved, towards = list(averages), list(parameters)
-    if moved:
+    # A frozen network may be one and the same in both.
+    pairs = [(average, parameter) for average, parameter in zip(averages, parameters, strict=True) if average is not parameter]
+    if pairs:
+        moved, towards = map(list, zip(*pairs, strict=True))
         th._foreach_mul_(moved, 1 - tau)
         th._foreach_add_(moved, towards, alpha=tau)

@@ -180,11 +180,12 @@ def check_training(study: optuna.Study, trainings: Mapping[str, Mapping[str, Any
         for key in settings | before:
             old, new = before.get(key, default), settings.get(key, default)
             if old != new and key not in SCORELESS:
-                is_scored = bool(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED)))
+                trials = study.get_trials(deepcopy=False)
+                is_empty = all(trial.state in (TrialState.FAIL, TrialState.WAITING) for trial in trials)
                 raise ValueError(
                     f"study {study.study_name!r} was begun with {key}={old!r}, not {new!r} ({name}): another search needs "
                     "a file of another name, another benchmark a folder of its own"
-                    + ("" if is_scored else ". This one has no score yet: nothing is lost if you delete it")
+                    + (". This one has no score yet: delete it if nothing of it is to be kept" if is_empty else "")
                 )
     if begun != study.user_attrs.get(TRAINING_KEY):
         study.set_user_attr(TRAINING_KEY, begun)

@@ -343,8 +343,8 @@ class AuxLossSampler(BaseGASampler):
         with self._lock:
             self._refresh(study)
             waiting = [n for n in self._register.open if self._register.trials[n].state == TrialState.WAITING]
-            if waiting and min(waiting) in self._register.places:
-                return True  # a copy of a trial whose worker died, which is next and brings its place
+            if waiting and min(waiting) in self._register.places and not self._register.is_shared(min(waiting)):
+                return True  # a copy of a trial whose worker died is next, and nobody has taken its place
             # Before the first trial chose, the seed of the study may still be open.
             return not self._register.holders or self._nth_free(study, len(self._register.unplaced())) is not None
 

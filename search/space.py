@@ -118,17 +118,19 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
     ):
         if searched != value:
             raise ValueError(f"the sampler searches with {name}={searched!r}, suggest_aux_loss asks for {name}={value!r}")
-    name = "horizon"
-    params: dict[str, Any] = {}
+    name, params = "horizon", dict[str, Any]()
+    choices: Sequence[Any] = range(1, max_horizon + 1)
     try:
         horizon = params[name] = trial.suggest_int(name, 1, max_horizon)
         if not 1 <= horizon <= longest:  # Optuna only warns of an enqueued one
             raise optuna.TrialPruned(f"horizon must be between 1 and {longest}, not {horizon}")
         for name, distribution in distributions(horizon, max_horizon, operators).items():
             if isinstance(distribution, CategoricalDistribution):
-                params[name] = trial.suggest_categorical(name, distribution.choices)
+                choices = distribution.choices
+                params[name] = trial.suggest_categorical(name, choices)
     except (TypeError, ValueError) as error:
-        if name in getattr(trial, "_fixed_params", ()):  # enqueued: anything may be
+        enqueued = getattr(trial, "_fixed_params", {})  # anything may be
+        if name in enqueued and enqueued[name] not in choices:
             raise optuna.TrialPruned(f"{name} was enqueued with a value that it cannot have: {error}") from None
         raise
     try:

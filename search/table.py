@@ -244,8 +244,7 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
         and the runs ``left_out``
     """
     rows = []
-    scale = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
-    for (checkpoint, tasks), of_scale in runs.groupby(["checkpoint", scale], sort=False):
+    for (checkpoint, tasks), of_scale in runs.groupby(["checkpoint", _scale(runs)], sort=False):
         common, scores = _scores(of_scale)
         tasks = task_name(common[0]) if len(common) == 1 else tasks
         of_common = of_scale[of_scale["environment"].isin(common)]
@@ -259,6 +258,11 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
             rows.append((checkpoint, tasks, variant, len(common), len(asked), matrix.size, iqm, *interval, left_out))
     columns = ["checkpoint", "tasks", "variant", "n_tasks", "asked", "runs", "iqm", "low", "high", "left_out"]
     return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
+
+
+def _scale(runs: pd.DataFrame) -> pd.Series:
+    """The tasks whose returns can be averaged: those of DeepMind Control together, each other one for itself."""
+    return runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
 
 
 def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
@@ -469,15 +473,16 @@ def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, b
         )
     if iqm["left_out"].any():
         lines.append("Interquartile means leave out the seeds that a variant has on some of the tasks only.")
-    for checkpoint, part in comparison[comparison["environment"] != NORMALIZED].groupby("checkpoint"):
-        there = part[part["runs"] > 0]
-        n_variants = there.groupby("environment", sort=False)["variant"].nunique()
-        some = [task_name(str(name)) for name in n_variants[n_variants < there["variant"].nunique()].index]
+    there = comparison[(comparison["environment"] != NORMALIZED) & (comparison["runs"] > 0)]
+    for (checkpoint, _), part in there.groupby(["checkpoint", _scale(there)]):
+        n_variants = part.groupby("environment", sort=False)["variant"].nunique()
+        some = [task_name(str(name)) for name in n_variants[n_variants < part["variant"].nunique()].index]
         if some:
             lines.append(
-                f"At {_steps(checkpoint)} not every variant has runs on {', '.join(some)}: interquartile means leave that "
-                "out, and each probability is over the tasks that both variants have runs on."
+                f"At {_steps(checkpoint)} not every variant has runs on {', '.join(some)}: interquartile means leave that out."
             )
+    if better.groupby("checkpoint")["n_tasks"].nunique().gt(1).any():
+        lines.append("Each probability is over the tasks that both variants have runs on, which are not the same for all.")
     if (better["probability"].isin([0, 1]) & (better["low"] == better["high"])).any():
         lines.append(
             "An interval without width says only that no run of one variant is better than any of the other: resampled runs "

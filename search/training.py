@@ -14,6 +14,7 @@ import re
 import shutil
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -341,8 +342,11 @@ def _made(environment: str, make: Callable[..., Any], *args: Any, **kwargs: Any)
     except Exception as error:
         if memory_problem(error) or "CUDA error" in str(error):
             raise
-        text = " ".join(str(error).split())
-        raise ConfigError(f"{environment} cannot be trained with these settings: {type(error).__name__}: {text}") from error
+        text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        last = traceback.extract_tb(error.__traceback__)[-1]  # it may be an environment of the user's that is at fault
+        raise ConfigError(
+            f"{environment} cannot be trained with these settings: {text} ({last.filename}, line {last.lineno})"
+        ) from error
 
 
 def _was_killed(error: Exception, *envs: VecEnv) -> bool:

@@ -287,7 +287,7 @@ def test_a_search_that_trains_otherwise_is_another_one(tmp_path: Path, changed: 
     values = {**vars(CONFIG), "hyperparameters": tmp_path / "hyperparameters.yml"}
     for accepted in ({}, {"stages": 9}, {"stages": 9, "overrides": {"device": "cpu"}}):
         next(evolve.search(SearchConfig(**{**values, **accepted}), tmp_path, str(tmp_path), None))
-    with pytest.raises(ValueError, match=f"'some' was begun with {name}=.* no score yet: nothing is lost if you delete it"):
+    with pytest.raises(ValueError, match=f"'some' was begun with {name}=.* no score yet: delete it"):
         next(evolve.search(SearchConfig(**{**values, **changed}), tmp_path, str(tmp_path), None))
     assert load_study(open_storage(tmp_path), "some").user_attrs[grid.TRAINING_KEY]["candidates"]["batch_size"] == 8
 

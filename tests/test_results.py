@@ -145,22 +145,30 @@ def last_returns(folder: str, variant: str, task: str = "cheetah-run") -> list[f
 def test_what_was_decided() -> None:
     """What results/choices_small/about.md says of the runs beside it, and that it is what SACAux does."""
     choices = ("", "_separate", "_joint", "_predictor")
+
+    def are_close(one: list[float], other: list[float]) -> bool:
+        error = math.sqrt(sum(statistics.variance(runs) / len(runs) for runs in (one, other)))
+        return min(len(one), len(other)) >= 3 and abs(statistics.mean(one) - statistics.mean(other)) < 2 * error
+
     for task in ("cheetah-run", "walker-walk"):
         runs = [last_returns("choices_small", f"aarl_state_small{choice}", task) for choice in choices]
         default, separate, joint, predictor = runs
         assert min(map(len, runs)) >= 3
         assert max(joint) < min(default + separate + predictor)
         bf16 = last_returns("choices_small", "aarl_state_small_bf16", task)
-        error = math.sqrt(sum(statistics.variance(of_precision) / len(of_precision) for of_precision in (default, bf16)))
-        assert len(bf16) >= 3 and abs(statistics.mean(default) - statistics.mean(bf16)) < 2 * error
+        assert are_close(default, bf16)
+        baselines = ("curl_state_small", "sac_dense_mlp_small", "sac_identity_small")
+        curl, sac, identity = (last_returns("choices_small", baseline, task) for baseline in baselines)
+        assert are_close(curl, sac) is (task == "walker-walk") and min(len(curl), len(identity)) >= 3
+        assert task == "walker-walk" or statistics.mean(curl) < statistics.mean(sac)
+        assert max(curl + sac + identity) < min(default)
         assert statistics.stdev(bf16) > statistics.stdev(default)
         for other in (separate, predictor):
             assert statistics.mean(other) < statistics.mean(default) and statistics.stdev(other) > statistics.stdev(default)
         if task == "walker-walk":
             assert max(separate) < min(default) and min(bf16) < 0.75 * min(default)
         else:
-            baseline = last_returns("choices_small", "sac_dense_mlp_small")
-            assert len(baseline) >= 3 and max(baseline) < min(default + separate + joint + predictor + bf16)
+            assert max(curl + sac + identity) < min(default + separate + joint + predictor + bf16)
     identity, *orthogonal = (
         last_returns("choices_small", f"sac_identity_small{choice}") for choice in ("", "_orthogonal", "_orthogonal_squashed")
     )
@@ -193,9 +201,18 @@ def test_the_figures_of_the_first_readme() -> None:
         returns = [last_returns("choices_small", variant, task) for task in ("cheetah-run", "walker-walk")]
         return between.join(f"{statistics.mean(of_task):.0f} ± {statistics.stdev(of_task):.0f}" for of_task in returns)
 
-    assert f"AARL-State gets {both('aarl_state_small', ' there, and ')} on Walker-Walk" in readme
-    assert f"; {both('aarl_state_small_joint', ' and ')} where one optimizer" in readme
+    variants = [f"{name}_small" for name in ("aarl_state", "sac_dense_mlp", "curl_state", "sac_identity")]
+    columns = [both(variant, "|").split("|") for variant in variants]
+    for row, task in enumerate(("Cheetah-Run", "Walker-Walk")):
+        assert " | ".join([task, *(column[row] for column in columns)]) in readme
+    n_runs = [
+        len(last_returns("choices_small", variant, task)) for variant in variants for task in ("cheetah-run", "walker-walk")
+    ]
+    assert n_runs == [3] * 6 + [n_runs[6], 3] and f"3 seeds each, {n_runs[6]} of the last on Cheetah-Run" in readme
+    walker = paper_scores(4).query("checkpoint == 100_000 and environment == 'dm_control/walker-walk-v0'")["mean"]
+    assert f"all four are level on Walker-Walk ({walker.min():.0f} to {walker.max():.0f})" in readme
+    assert f"AARL-State gets {both('aarl_state_small_joint', ' and ')} where one optimizer" in readme
     assert f"in bfloat16 {both('aarl_state_small_bf16', ' and ')}, emulated" in readme
     abouts = read_abouts(RESULTS / "choices_small")[0].values()
     minutes = [about["seconds"] / 60 for about in abouts if about["variant"] == "aarl_state_small"]
-    assert f"in {min(minutes):.0f} to {max(minutes):.0f} minutes of one core" in readme
+    assert f"(AARL-State: {min(minutes):.0f} to {max(minutes):.0f} minutes of one core)" in readme

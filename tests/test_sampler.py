@@ -840,6 +840,16 @@ def test_a_copy_brings_a_place_where_there_is_no_other(monkeypatch: pytest.Monke
 
 
 @pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
+def test_a_copy_whose_place_is_taken_brings_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    study, _ = heartbeat_study(monkeypatch, n_random=1, random=0.0, replacement=0.7)
+    trial = study.ask()
+    study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+    assert ask_for_place(study) == (1, 0)
+    RetryHeartbeatStaleTrialCallback()(study, study.trials[0])
+    assert isinstance(study.sampler, AuxLossSampler) and not study.sampler.has_place(study)
+
+
+@pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
 def test_a_copy_that_comes_too_late_takes_another_place(monkeypatch: pytest.MonkeyPatch) -> None:
     study, _ = heartbeat_study(monkeypatch)
     trial = study.ask()

@@ -1,5 +1,6 @@
 """What SB3 promises for SAC holds for SACAux: spaces, images, vectorized environments, wrappers, callbacks, options."""
 
+import threading
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
@@ -495,9 +496,68 @@ class AroundTheOne(AroundNetwork):
         self.last = nn.Linear(6, 6)
 
 
-def test_an_encoder_that_critic_and_target_would_share_is_refused() -> None:
-    with pytest.raises(ValueError, match="AroundTheOne gives critic and target critic the same parameters"):
-        make_model(policy_kwargs={"features_extractor_class": AroundTheOne})
+@pytest.mark.parametrize("extractor", [AroundTheOne, partial(AroundNetwork, network=nn.Linear(3, 5))])
+def test_an_encoder_that_critic_and_target_would_share_is_refused(extractor: Any) -> None:
+    with pytest.raises(ValueError, match=r"Around.* gives critic and target critic the same parameters"):
+        make_model(policy_kwargs={"features_extractor_class": extractor})
+
+
+def test_a_frozen_network_may_be_shared() -> None:
+    network = nn.Linear(3, 5).requires_grad_(False)
+    before = network.weight.clone()
+    model = make_model(policy_kwargs={"features_extractor_class": partial(AroundNetwork, network=network)})
+    assert model.critic.features_extractor.network is model.critic_target.features_extractor.network is network
+    moved = moved_by_training(model, 60)
+    assert moved["encoder"] == moved["momentum encoder"] == [False, False, True, True]
+    assert th.equal(network.weight, before)
+
+
+def test_arguments_of_an_encoder_that_cannot_be_copied() -> None:
+    network = nn.utils.weight_norm(nn.Linear(3, 5))
+    kwargs = {"features_extractor_class": AroundNetwork, "features_extractor_kwargs": {"network": network}}
+    with pytest.raises(ValueError, match=r"features_extractor_kwargs\['network'\] cannot be copied, .* one of its own: Only"):
+        make_model(policy_kwargs=kwargs)
+
+    class Locked(AroundNetwork):
+        def __init__(self, observation_space: spaces.Space, lock: Any):
+            super().__init__(observation_space, nn.Linear(3, 5))
+            self.lock = lock
+
+    lock = threading.Lock()  # no network: none of anybody's own
+    kwargs = {"features_extractor_class": Locked, "features_extractor_kwargs": {"lock": lock}}
+    model = make_model(policy_kwargs=kwargs)
+    assert model.critic.features_extractor.lock is model.critic_target.features_extractor.lock is lock
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
+@pytest.mark.parametrize("space", [VECTOR, spaces.Dict({"a": VECTOR, "b": spaces.Box(-1, 1, ())})], ids=str)
+def test_an_actor_is_traced_and_exported_for_batches_of_any_size(space: spaces.Space) -> None:
+    model = make_model(RandomEnv(space), "MlpPolicy" if space is VECTOR else "MultiInputPolicy")
+
+    def batch(size: int) -> Any:
+        some = [space.sample() for _ in range(size)]
+        if isinstance(space, spaces.Dict):
+            return {key: th.as_tensor(np.array([each[key] for each in some])) for key in space}
+        return th.as_tensor(np.array(some))
+
+    class Deterministic(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.actor = model.actor
+
+        def forward(self, obs: Any) -> th.Tensor:
+            return self.actor(obs, deterministic=True)
+
+    traced = th.jit.trace(Deterministic(), (batch(1),))
+    several = batch(5)
+    with th.no_grad():
+        th.testing.assert_close(traced(several), model.actor(several, deterministic=True))
+        if space is VECTOR:
+            size = th.export.Dim("size")
+            encoder = model.critic.features_extractor  # the distribution around the rest checks its parameters
+            exported = th.export.export(encoder, (batch(3),), dynamic_shapes=({0: size},)).module()
+            th.testing.assert_close(exported(several), encoder(several))
+            assert model.predict(np.zeros((0, 3), np.float32))[0].shape == (0, 2)
 
 
 class Doubled(DenseMLP):

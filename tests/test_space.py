@@ -1,5 +1,6 @@
 """The search space: parameters and back, validity, and the distribution of random losses and of the priors."""
 
+import contextlib
 from itertools import product
 from typing import Any
 
@@ -221,6 +222,18 @@ def test_an_enqueued_value_that_a_parameter_cannot_have_is_pruned(
     if isinstance(sampler, AuxLossSampler):
         # It is not another try of the first, and the first costs no place.
         assert [study.trials[i].system_attrs[PLACE_KEY]["place"] for i in range(2)] == [0, 0]
+
+
+def test_an_error_that_is_not_of_an_enqueued_value_is_raised() -> None:
+    study = optuna.create_study(sampler=RandomSampler(seed=0))
+    study.enqueue_trial({"horizon": 1, "operator": "mse"})
+    study.enqueue_trial({"horizon": 1, "operator": "mse"})
+    first = study.ask()
+    with contextlib.suppress(optuna.TrialPruned):
+        suggest_aux_loss(first, 1, ["mse", "inner"])
+    study.tell(first, 0.0)
+    with pytest.raises(ValueError, match="dynamic value space"):
+        suggest_aux_loss(study.ask(), 1, ["mse", "cosine"])
 
 
 @pytest.mark.parametrize(("operators", "culprit"), [(("mse", "l1"), "l1"), ("mse", "mse"), ((), r"\(\)")])

@@ -245,8 +245,9 @@ def test_statistics_are_over_tasks_of_one_scale_that_all_variants_have(tmp_path:
     assert better.loc[("a", "b"), "probability"] == pytest.approx(np.mean([0.0, (0.5 + 1 + 0 + 1) / 4]))
     assert better.loc[("a", "b"), "n_tasks"] == 2
     shown = runner.invoke(app, ["table", str(tmp_path)]).stdout
-    line = "At 100K not every variant has runs on walker-walk: interquartile means leave that out"
-    assert " ".join(shown.split()).count(line) == 1
+    line = "At 100K not every variant has runs on walker-walk: interquartile means leave that out."
+    assert " ".join(shown.split()).count(line) == shown.count("not every variant") == 1
+    assert "Each probability is over" not in shown
 
 
 def test_each_probability_is_over_the_tasks_of_its_two_variants(tmp_path: Path) -> None:
@@ -269,6 +270,10 @@ def test_each_probability_is_over_the_tasks_of_its_two_variants(tmp_path: Path) 
         ("c", "b"): 0.0,
     }
     assert better["n_tasks"].to_dict() == {pair: 2 if "c" not in pair else 1 for pair in better.index}
+    shown = " ".join(runner.invoke(app, ["table", str(tmp_path)]).stdout.split())
+    # Nobody but d was to be on Pendulum-v1, which is of another scale.
+    assert "At 100K not every variant has runs on cheetah-run: interquartile" in shown and shown.count("not every") == 1
+    assert shown.count("Each probability is over the tasks that both variants have runs on") == 1
 
 
 def test_numbers_of_episodes_that_differ_are_named(tmp_path: Path) -> None:
