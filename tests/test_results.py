@@ -173,6 +173,10 @@ def test_what_was_decided() -> None:
         last_returns("choices_small", f"sac_identity_small{choice}") for choice in ("", "_orthogonal", "_orthogonal_squashed")
     )
     assert all(len(runs) >= 3 and statistics.stdev(runs) < statistics.stdev(identity) for runs in orthogonal)
+    on_walker = [last_returns("choices_small", f"sac_identity_small{choice}", "walker-walk") for choice in ("", "_orthogonal")]
+    squashed = last_returns("choices_small", "sac_identity_small_orthogonal_squashed", "walker-walk")
+    assert len(on_walker[1]) == len(squashed) == 2 and min(on_walker[1]) > max(on_walker[0])
+    assert min(squashed) < max(on_walker[0]) < max(squashed)
     arguments = inspect.signature(SACAux).parameters
     of_policy = inspect.signature(SACAux.policy_aliases["MlpPolicy"]).parameters
     assert arguments["precision"].default == "fp32"
