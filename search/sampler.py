@@ -342,11 +342,12 @@ class AuxLossSampler(BaseGASampler):
         """
         with self._lock:
             self._refresh(study)
-            waiting = [n for n in self._register.open if self._register.trials[n].state == TrialState.WAITING]
-            if waiting and min(waiting) in self._register.places and not self._register.is_shared(min(waiting)):
+            register = self._register
+            first = min((n for n in register.open if register.trials[n].state == TrialState.WAITING), default=None)
+            if first in register.places and not register.is_shared(first):
                 return True  # a copy of a trial whose worker died is next, and nobody has taken its place
             # Before the first trial chose, the seed of the study may still be open.
-            return not self._register.holders or self._nth_free(study, len(self._register.unplaced())) is not None
+            return not register.holders or self._nth_free(study, len(register.unplaced())) is not None
 
     # Optuna's interface.
 
@@ -380,11 +381,6 @@ class AuxLossSampler(BaseGASampler):
             return params
         # Enqueued: what the user left open is drawn at random, so that a valid loss comes out if there is one.
         given = {**trial.params, **trial.system_attrs.get(FIXED_KEY, {})}
-        if "horizon" in given:
-            horizon = given["horizon"]
-            if not isinstance(horizon, (int, float, np.number)) or horizon not in range(1, self.max_horizon + 1):
-                return {}  # suggest_aux_loss refuses it
-            given["horizon"] = int(horizon)  # 7.0 of a table, as Optuna takes it
         rng = np.random.default_rng([claim["seed"], claim["stage"], claim["place"], claim["attempt"]])
         for _ in range(MAX_DRAWS):
             params = {

@@ -286,11 +286,15 @@ def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFra
     return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high"])
 
 
+def _are_common(there: pd.DataFrame) -> pd.Series:
+    """Of each task, whether all variants that have any run have runs on it."""
+    return there.groupby("environment")["variant"].nunique() == there["variant"].nunique()
+
+
 def _scores(runs: pd.DataFrame) -> tuple[list[str], dict[str, list[np.ndarray]]]:
     """Tasks that all variants that have any run have runs on, and for each of these the scores on each of them."""
     there = runs.dropna(subset="mean")
-    tasks = there.groupby("environment")["variant"].nunique()
-    common = [str(name) for name, n_variants in tasks.items() if n_variants == there["variant"].nunique()]
+    common = [str(name) for name, is_common in _are_common(there).items() if is_common]
     scores = {
         (variant, task): group.to_numpy() for (variant, task), group in there.groupby(["variant", "environment"])["mean"]
     }
@@ -475,8 +479,7 @@ def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, b
         lines.append("Interquartile means leave out the seeds that a variant has on some of the tasks only.")
     there = comparison[(comparison["environment"] != NORMALIZED) & (comparison["runs"] > 0)]
     for (checkpoint, _), part in there.groupby(["checkpoint", _scale(there)]):
-        n_variants = part.groupby("environment", sort=False)["variant"].nunique()
-        some = [task_name(str(name)) for name in n_variants[n_variants < part["variant"].nunique()].index]
+        some = [task_name(str(name)) for name, is_common in _are_common(part).items() if not is_common]
         if some:
             lines.append(
                 f"At {_steps(checkpoint)} not every variant has runs on {', '.join(some)}: interquartile means leave that out."

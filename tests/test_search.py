@@ -71,7 +71,7 @@ def trials(folder: Path, study: str = "small") -> list[optuna.trial.FrozenTrial]
 
 def wait_for(folder: Path, process: subprocess.Popen[str], finished: int) -> None:
     """Until so many candidates are complete and others are being trained."""
-    for _ in range(1800):  # a busy machine may need minutes
+    for _ in range(600):
         time.sleep(0.1)
         assert process.poll() is None, process.communicate()[0]
         if (folder / "runs/small/journal.log").exists():
