@@ -525,6 +525,7 @@ class AuxLossSampler(BaseGASampler):
     def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int, is_given: bool) -> bool:
         """Take a place for a trial; False if another one has it too."""
         evolution = self._get_evolution(study)
+        before = list(self._register.holders[stage, place])
         attempt = self._register.attempt(stage, place, self.retries)
         operation, loss = "enqueued", None
         parents: list[int] = []
@@ -537,9 +538,10 @@ class AuxLossSampler(BaseGASampler):
         claim = {"stage": stage, "place": place, "attempt": attempt, "seed": evolution.seed, **drawn}
         storage.set_trial_system_attr(trial_id, PLACE_KEY, claim)
         # Others may have seen other trials without a place, and choose the same one at this moment. So everybody looks back,
-        # and gives way if he is not alone: one of two, at least, sees the other.
+        # and gives way if he is not alone: one of two, at least, sees the other. Also if the other one has failed since: what
+        # was drawn here may be what failed.
         self._refresh(study)
-        if self._register.is_shared(trial.number):
+        if self._register.holders[stage, place] != sorted([*before, trial.number]):
             self._give_back(study, trial)
             return False
         if left_over is not None:

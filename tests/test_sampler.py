@@ -749,6 +749,50 @@ def test_an_enqueued_trial_that_comes_out_of_turn_does_not_share_a_place(monkeyp
     assert list(map(place_of, study.trials)) == [(1, 0), (1, 1)]
 
 
+@pytest.mark.parametrize("ends", ["fails", "dies", "fails, enqueued", "is interrupted, enqueued"])
+def test_a_place_that_another_trial_had_for_a_moment_is_chosen_anew(ends: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    study, undisturbed = (make_study(storage=optuna.storages.InMemoryStorage()) for _ in range(2))
+    other = optuna.load_study(study_name="study", storage=study._storage, sampler=AuxLossSampler(**SETTINGS, seed=0))
+
+    def one_that_ends(study: optuna.Study) -> None:
+        if "enqueued" in ends:
+            study.enqueue_trial({"horizon": 1, "target_0_s": True}, skip_if_exists=False)
+        trial = study.ask()
+        suggest_aux_loss(trial, 2)
+        if ends == "dies" or "interrupted" in ends:
+            trial.set_user_attr(workers.DIED_KEY if ends == "dies" else "interrupted", True)
+        study.tell(trial, state=TrialState.FAIL)
+
+    take = AuxLossSampler._take
+
+    def take_late(sampler: AuxLossSampler, *arguments: Any) -> bool:
+        # A slow worker: while it draws its candidate, another one takes the place, and fails.
+        monkeypatch.setattr(AuxLossSampler, "_take", take)
+        candidate = module._Evolution.candidate
+
+        def late(self: Any, *place: Any) -> module.Candidate:
+            monkeypatch.setattr(module._Evolution, "candidate", candidate)
+            with monkeypatch.context() as patch:  # it does not see the slow one yet
+                patch.setattr(module._Register, "unplaced", lambda *arguments, **keywords: [])
+                one_that_ends(other)
+            return candidate(self, *place)
+
+        monkeypatch.setattr(module._Evolution, "candidate", late)
+        return take(sampler, *arguments)
+
+    monkeypatch.setattr(AuxLossSampler, "_take", take_late)
+    slow = study.ask()
+    one_that_ends(undisturbed)
+    expected = undisturbed.ask()
+    for trial in (slow, expected):
+        suggest_aux_loss(trial, 2)
+    # The slow one has the lower number, as it asked before.
+    assert slow.number == 0 and expected.number == 1
+    assert slow.params == expected.params
+    claims = [s.trials[n].system_attrs[PLACE_KEY] for s, n in ((study, 0), (undisturbed, 1))]
+    assert claims[0] == claims[1]
+
+
 # Enqueued trials, heartbeats, pruners.
 
 
