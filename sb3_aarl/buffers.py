@@ -57,6 +57,21 @@ def _first_stack(frames: np.ndarray) -> str | None:
     return None if before.any() else "zeros"
 
 
+def to_device(values: np.ndarray | th.Tensor, device: th.device | None) -> th.Tensor:
+    """
+    What a sample is made of, on its device. The copy to a GPU is queued behind what that does, nobody waits for it.
+
+    :param values: Values, which the tensor may share
+    :param device: The device, None for main memory
+    """
+    tensor = th.as_tensor(values)
+    if device is not None and device.type == "cuda" and tensor.device.type == "cpu":
+        tensor = th.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor)
+    return tensor if device is None else tensor.to(device, non_blocking=True)
+
+
+# Rounds in which steps that end no whole window are drawn again, before all that do are looked up.
+MAX_REDRAWS = 8
 # Memory that drawn observations had, and that others may have after them: pieces and bytes in all, at most.
 MAX_SCRATCH, MAX_SCRATCH_BYTES = 8, 2**28
 # Of equal width.
@@ -149,7 +164,7 @@ class FrameStore:
         crop_size: int | None = None,
     ) -> th.Tensor:
         """
-        Stacked observations; all arguments have one shape (...).
+        Stacked observations; all arguments broadcast to the shape (...) of ``newest``.
 
         :param newest: Number of the transition whose row holds the newest frame
         :param envs: Env of each
@@ -162,20 +177,23 @@ class FrameStore:
         """
         back = np.arange(self.stack - 1, -1, -1)
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
-        numbers = np.ravel_multi_index((rows, np.broadcast_to(envs[..., None], rows.shape)), self.frames.shape[:2])
+        numbers = rows * self.frames.shape[1] + envs[..., None]
         corners = None if crop_size is None else self._random_corners(newest.shape, crop_size)
         stacked = self._read(self.frames, numbers, crop_size, corners)
-        is_final = th.as_tensor(final >= 0, device=self.device)
         # PyTorch cannot write to places of unsigned numbers but bytes.
         written = stacked.view(SIGNED.get(stacked.dtype, stacked.dtype))
-        if (final >= 0).any():
-            corners = None if corners is None else corners[:, is_final, -1]
-            finals = self._read(self.final_frames, final[final >= 0], crop_size, corners)
-            written[is_final, -1] = finals.view(written.dtype)
-        before = (back > age[..., None]) & zero_padded[..., None]
-        if before.any():
-            written[th.as_tensor(before, device=self.device)] = 0
+        if (is_final := final >= 0).any():
+            newest_of: Any = (*self._places(is_final), -1)
+            corners = None if corners is None else corners[(slice(None), *newest_of)]
+            finals = self._read(self.final_frames, final[is_final], crop_size, corners)
+            written[newest_of] = finals.view(written.dtype)
+        if self.stack > 1 and (before := (back > age[..., None]) & zero_padded[..., None]).any():
+            written[self._places(before)] = 0
         return stacked.flatten(newest.ndim, newest.ndim + 1) if self.stack > 1 else stacked.squeeze(newest.ndim)
+
+    def _places(self, mask: np.ndarray) -> tuple[th.Tensor, ...]:
+        """Where a mask is true, as indices; a GPU would wait to know how many a mask of its own has."""
+        return tuple(to_device(places, self.device) for places in np.nonzero(mask))
 
     def _random_corners(self, shape: tuple[int, ...], crop_size: int) -> th.Tensor:
         """Top and left of a crop for every observation, the same for all frames of its stack: (2, *shape, stack)."""
@@ -193,20 +211,22 @@ class FrameStore:
         :param corners: Top and left of the crops, (2, ...)
         :return: (..., *frame_shape), cropped or not
         """
-        length = math.prod(self.frame_shape)
-        starts = th.as_tensor(numbers, device=self.device) * length
-        if crop_size is not None and corners is not None:
-            # Of each channel all from its crop's first pixel to its last, pixels beside the crop included, is one piece.
-            channels, height, width = self.frame_shape
-            top, left = corners[..., None]
-            starts = starts[..., None] + th.arange(channels, device=self.device) * height * width + top * width + left
-            length = (crop_size - 1) * width + crop_size
         memory = th.as_tensor(frames).reshape(-1)
+        length = math.prod(self.frame_shape)
+        starts = to_device(numbers, self.device)
+        if crop_size is None or corners is None:
+            drawn = self._empty((numbers.size, length), memory)
+            th.index_select(memory.view(-1, length), 0, starts.flatten(), out=drawn)
+            return drawn.view(*numbers.shape, *self.frame_shape)
+        # Of each channel all from its crop's first pixel to its last, pixels beside the crop included, is one piece.
+        channels, height, width = self.frame_shape
+        top, left = corners[..., None]
+        channel = th.arange(channels, device=self.device) * height * width
+        starts = starts[..., None] * length + channel + top * width + left
+        length = (crop_size - 1) * width + crop_size
         pieces = memory.as_strided((len(memory) - length + 1, length), (1, 1))  # one from every place in memory on
         drawn = self._empty((starts.numel(), length), memory)
         th.index_select(pieces, 0, starts.flatten(), out=drawn)
-        if crop_size is None:
-            return drawn.view(*starts.shape, *self.frame_shape)
         drawn = drawn.view(*starts.shape, length)
         return drawn.as_strided((*starts.shape, crop_size, crop_size), (*drawn.stride()[:-1], width, 1))
 
@@ -260,8 +280,8 @@ class _Observations:
             return self[:][index]
         where = np.ogrid[: self.shape[0], : self.shape[1]]
         positions, envs = (part[index[:2]] for part in np.broadcast_arrays(*where))
-        observations = self.buffer.gather(self.key, positions, envs, self.following)
-        return observations.cpu().numpy()[(*(slice(None),) * positions.ndim, *index[2:])]
+        observations = self.buffer.gather(self.key, positions.reshape(-1), envs.reshape(-1), self.following).cpu().numpy()
+        return observations.reshape(*positions.shape, *self.shape[2:])[(*(slice(None),) * positions.ndim, *index[2:])]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:], dtype)
@@ -392,24 +412,24 @@ class WindowReplayBuffer(NStepReplayBuffer):
         crop_size: int | None = None,
     ) -> th.Tensor:
         """
-        Observations of one key; all arguments broadcast to one shape (...).
+        Observations of one key.
 
         :param key: Key of Dict observations, else ""
         :param positions: Positions in the buffer
-        :param envs: Envs
-        :param following: Whether to give the next observation instead
+        :param envs: Envs, one for each position, or of a shape that broadcasts to theirs
+        :param following: Whether to give the next observation instead; (...) is what it and positions broadcast to
         :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
         :return: (..., *observation shape), height and width those of the crop, on ``storage_device``
         """
-        positions, envs, following = np.broadcast_arrays(positions, envs, following)
+        at = positions * self.n_envs + envs
         # Positions before self.pos were written in this round of the ring, the others in the round before.
         numbers = self.n_added - self.pos + positions - np.where(positions < self.pos, 0, self.buffer_size)
         return self.stores[key].gather(
             numbers + following,
             envs,
-            self._age[positions, envs] + following,
-            self._zero_padded[key][positions, envs],
-            np.where(following, self._final_slot[positions, envs], -1),
+            self._age.take(at) + following,
+            self._zero_padded[key].take(at),
+            np.where(following, self._final_slot.take(at), -1),
             crop_size if key in self._image_keys else None,
         )
 
@@ -569,15 +589,35 @@ class WindowReplayBuffer(NStepReplayBuffer):
             # SB3's own code draws from the arrays that this buffer only seems to have.
             return super()._get_samples(batch_inds, env)
         envs = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
-        dones = self.dones[batch_inds, envs] * (1 - self.timeouts[batch_inds, envs])
-        samples = DictReplayBufferSamples if isinstance(self.observation_space, spaces.Dict) else ReplayBufferSamples
+        at = batch_inds * self.n_envs + envs
+        dones = self.dones.take(at) * (1 - self.timeouts.take(at))
+        # Observations and next ones together.
+        both = self._gather_all(batch_inds, envs, np.array([[False], [True]]), env, crop_size)
+        if isinstance(both, dict):
+            samples: Any = DictReplayBufferSamples
+            obs, next_obs = ({key: value[i] for key, value in both.items()} for i in range(2))
+        else:
+            samples, (obs, next_obs) = ReplayBufferSamples, both
         return samples(
-            self._gather_all(batch_inds, envs, False, env, crop_size),
-            self.to_torch(self.actions[batch_inds, envs], copy=False),
-            self._gather_all(batch_inds, envs, True, env, crop_size),
+            obs,
+            self.to_torch(self._actions(at), copy=False),
+            next_obs,
             self.to_torch(dones[:, None], copy=False),
-            self.to_torch(self._normalize_reward(self.rewards[batch_inds, envs][:, None], env), copy=False),
+            self.to_torch(self._normalize_reward(self.rewards.take(at)[:, None], env), copy=False),
         )
+
+    def _actions(self, at: np.ndarray) -> np.ndarray:
+        """The actions (..., action_dim) at places of (buffer_size, n_envs), one row after the other."""
+        return self.actions.reshape(-1, self.action_dim).take(at, axis=0)
+
+    def to_torch(self, array: np.ndarray, copy: bool = True) -> th.Tensor:
+        """
+        As in SB3, but that nothing waits for a GPU.
+
+        :param array: What is sampled
+        :param copy: Whether to copy it where it could be shared
+        """
+        return to_device(array.copy() if copy else array, self.device)
 
     def _gather_all(
         self,
@@ -594,22 +634,33 @@ class WindowReplayBuffer(NStepReplayBuffer):
             arrays: dict[str, Any] = {key: part.cpu().numpy() for key, part in parts.items()}
             normalized: Any = self._normalize_obs(arrays.get("", arrays), env)
             parts = normalized if isinstance(normalized, dict) else {"": normalized}
-        tensors = {key: th.as_tensor(part, device=self.device) for key, part in parts.items()}
+        tensors = {key: to_device(part, self.device) for key, part in parts.items()}
         return tensors.get("", tensors)
 
     def _draw_windows(self, batch_size: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
         """Positions of the last steps, and envs, of windows, uniform over all whole ones."""
         if horizon < 1:
             raise ValueError(f"a horizon is at least 1, not {horizon}")
-        # A step that has horizon - 1 steps of its episode before it ends a whole window, if they are all still there.
-        whole = self._age[: self.size()] >= horizon - 1
-        if self.full:
-            oldest = np.arange(min(horizon - 1, self.buffer_size))
-            whole[(self.pos + oldest) % self.buffer_size] = False
-        ends = np.flatnonzero(whole)
+        n_steps = self.size() * self.n_envs
+
+        def are_whole(ends: np.ndarray) -> np.ndarray:
+            # A step that has horizon - 1 steps of its episode before it ends a whole window, if they are all still there.
+            whole = self._age.take(ends) >= horizon - 1
+            return whole & ((ends // self.n_envs - self.pos) % self.buffer_size >= horizon - 1) if self.full else whole
+
+        # Most steps do. Those that do not are drawn again, without a look at all the others.
+        ends = np.random.randint(n_steps, size=batch_size) if n_steps else np.zeros(0, np.int64)
+        for _ in range(MAX_REDRAWS):
+            again = np.flatnonzero(~are_whole(ends))
+            if not len(again):
+                break
+            ends[again] = np.random.randint(n_steps, size=len(again))
+        else:
+            ends = np.flatnonzero(are_whole(np.arange(n_steps)))
+            ends = ends[np.random.randint(len(ends), size=batch_size)] if len(ends) else ends
         if not len(ends):
             raise NoWindowError(f"no episode in the replay buffer spans {horizon} agent steps yet")
-        positions, envs = np.divmod(ends[np.random.randint(len(ends), size=batch_size)], self.n_envs)
+        positions, envs = np.divmod(ends, self.n_envs)
         return positions, envs
 
     def sample_windows(
@@ -640,12 +691,13 @@ class WindowReplayBuffer(NStepReplayBuffer):
         following = wanted == horizon
         # Gathered one offset after the other, so that all observations at some of the offsets lie together.
         observations = self._gather_all(steps[:, wanted - following].T, envs, following[:, None], env, crop_size)
-        rewards = self._normalize_reward(self.rewards[steps, envs[:, None]][..., None], env)
+        at = steps * self.n_envs + envs[:, None]
+        rewards = self._normalize_reward(self.rewards.take(at)[..., None], env)
         return WindowSamples(
             {key: value.transpose(0, 1) for key, value in observations.items()}
             if isinstance(observations, dict)
             else observations.transpose(0, 1),
-            self.to_torch(self.actions[steps, envs[:, None]], copy=False),
+            self.to_torch(self._actions(at), copy=False),
             self.to_torch(rewards, copy=False),
         )
 

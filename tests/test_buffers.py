@@ -249,15 +249,16 @@ LIFE = [(7, "truncated"), (1, "terminated"), (4, "terminated"), (12, "truncated"
 
 
 @pytest.mark.parametrize("horizon", [1, 3, 7])
-def test_whole_windows_are_drawn_uniformly(horizon):
+@pytest.mark.parametrize("batch_size", [8, 3000])  # with the larger one some steps of no window remain, and are looked up
+def test_whole_windows_are_drawn_uniformly(batch_size, horizon):
     buffer = make_buffer(80, n_envs=2)
     histories = filled(buffer, 101, LIFE, stack=1, padding="repeat")
     windows = whole_windows(histories, buffer.buffer_size, horizon)
     np.random.seed(0)
-    drawn = buffer.sample_windows(200 * len(windows), horizon)
     counts = dict.fromkeys(windows, 0)
-    for env, number in drawn.actions[:, 0]:
-        counts[(int(env), int(number))] += 1
+    for _ in range(1 + 200 * len(windows) // batch_size):
+        for env, number in buffer.sample_windows(batch_size, horizon).actions[:, 0]:
+            counts[(int(env), int(number))] += 1
     assert chisquare(list(counts.values())).pvalue > 0.01
 
 
@@ -801,6 +802,22 @@ def test_crops_from_arrays_and_from_tensors_are_the_same():
         drawn.append([*buffer.sample(50, crop_size=CROP)[:5], *buffer.sample_windows(50, 3, crop_size=CROP)])
     for one, other in zip(*drawn, strict=True):
         assert_same(one, other)
+
+
+@pytest.mark.parametrize("crop_size", [None, CROP])
+@pytest.mark.parametrize("padding", ["repeat", "zeros"])
+def test_drawing_from_a_gpu_does_not_wait_for_it(crop_size, padding):
+    """On PyTorch's meta device, where tensors have no values, whatever asks for one fails."""
+    drawn = []
+    for device in ("cpu", "meta"):
+        buffer = image_buffer(3, storage_device=device) if crop_size else make_buffer(40, stack=3, storage_device=device)
+        if not crop_size:
+            filled(buffer, 60, LIFE, stack=3, padding=padding)
+        buffer.device = th.device(device)
+        drawn.append([*buffer.sample(50, crop_size=crop_size), *buffer.sample_windows(50, 3, crop_size=crop_size)])
+    for here, there in zip(*drawn, strict=True):
+        assert (here is None) == (there is None)  # discounts
+        assert here is None or (there.device.type, there.shape, there.dtype) == ("meta", here.shape, here.dtype)
 
 
 def test_memory_of_batches_is_used_again_once_nobody_has_them():
