@@ -25,6 +25,16 @@ except ImportError:  # an extra of SB3
     psutil = None  # type: ignore[assignment]
 
 
+# Copies to a GPU that nobody waits for are of at most this size.
+MAX_PINNED_BYTES = 2**20
+# Rounds in which steps that end no whole window are drawn again, before all that do are looked up.
+MAX_REDRAWS = 8
+# Memory that drawn observations had, and that others may have after them: pieces and bytes in all, at most.
+MAX_SCRATCH, MAX_SCRATCH_BYTES = 8, 2**28
+# Of equal width.
+SIGNED = {th.uint16: th.int16, th.uint32: th.int32, th.uint64: th.int64}
+
+
 class WindowSamples(NamedTuple):
     """
     Windows of one horizon k; ``observations`` is a dict of such tensors for Dict observations.
@@ -59,23 +69,19 @@ def _first_stack(frames: np.ndarray) -> str | None:
 
 def to_device(values: np.ndarray | th.Tensor, device: th.device | None) -> th.Tensor:
     """
-    What a sample is made of, on its device. The copy to a GPU is queued behind what that does, nobody waits for it.
+    What a sample is made of, on its device. Copies to a GPU are queued behind what that does, and nobody waits for them, but
+    for images: many batches of them would lie in pinned memory.
 
     :param values: Values, which the tensor may share
-    :param device: The device, None for main memory
+    :param device: The device, None for the one where they are
     """
     tensor = th.as_tensor(values)
-    if device is not None and device.type == "cuda" and tensor.device.type == "cpu":
-        tensor = th.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor)
-    return tensor if device is None else tensor.to(device, non_blocking=True)
-
-
-# Rounds in which steps that end no whole window are drawn again, before all that do are looked up.
-MAX_REDRAWS = 8
-# Memory that drawn observations had, and that others may have after them: pieces and bytes in all, at most.
-MAX_SCRATCH, MAX_SCRATCH_BYTES = 8, 2**28
-# Of equal width.
-SIGNED = {th.uint16: th.int16, th.uint32: th.int32, th.uint64: th.int64}
+    if device is None:
+        return tensor
+    if device.type == "cuda" and tensor.device.type == "cpu" and tensor.nbytes <= MAX_PINNED_BYTES:
+        pinned = th.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor)
+        return pinned.to(device, non_blocking=True)  # PyTorch keeps pinned memory as long as a copy is under way
+    return tensor.to(device)
 
 
 class FrameStore:
@@ -215,8 +221,9 @@ class FrameStore:
         length = math.prod(self.frame_shape)
         starts = to_device(numbers, self.device)
         if crop_size is None or corners is None:
+            rows = math.prod(frames.shape[: frames.ndim - len(self.frame_shape)])
             drawn = self._empty((numbers.size, length), memory)
-            th.index_select(memory.view(-1, length), 0, starts.flatten(), out=drawn)
+            th.index_select(memory.view(rows, length), 0, starts.flatten(), out=drawn)
             return drawn.view(*numbers.shape, *self.frame_shape)
         # Of each channel all from its crop's first pixel to its last, pixels beside the crop included, is one piece.
         channels, height, width = self.frame_shape
@@ -415,7 +422,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         Observations of one key.
 
         :param key: Key of Dict observations, else ""
-        :param positions: Positions in the buffer
+        :param positions: Positions in the buffer, at least one axis; like envs not checked
         :param envs: Envs, one for each position, or of a shape that broadcasts to theirs
         :param following: Whether to give the next observation instead; (...) is what it and positions broadcast to
         :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
@@ -588,6 +595,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         if self.n_steps > 1:
             # SB3's own code draws from the arrays that this buffer only seems to have.
             return super()._get_samples(batch_inds, env)
+        batch_inds = np.asarray(batch_inds, np.int64)  # small integers could not count all transitions
         envs = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
         at = batch_inds * self.n_envs + envs
         dones = self.dones.take(at) * (1 - self.timeouts.take(at))
@@ -612,12 +620,12 @@ class WindowReplayBuffer(NStepReplayBuffer):
 
     def to_torch(self, array: np.ndarray, copy: bool = True) -> th.Tensor:
         """
-        As in SB3, but that nothing waits for a GPU.
+        As in SB3, but that nobody waits for a GPU.
 
         :param array: What is sampled
         :param copy: Whether to copy it where it could be shared
         """
-        return to_device(array.copy() if copy else array, self.device)
+        return super().to_torch(array, copy) if copy else to_device(array, self.device)
 
     def _gather_all(
         self,
@@ -642,24 +650,26 @@ class WindowReplayBuffer(NStepReplayBuffer):
         if horizon < 1:
             raise ValueError(f"a horizon is at least 1, not {horizon}")
         n_steps = self.size() * self.n_envs
-
-        def are_whole(ends: np.ndarray) -> np.ndarray:
-            # A step that has horizon - 1 steps of its episode before it ends a whole window, if they are all still there.
+        # A step that has horizon - 1 steps of its episode before it ends a whole window, if they are all still there. Most
+        # steps do; those that do not are drawn again, without a look at all the others.
+        ends, wrong = np.zeros(batch_size, np.int64), np.arange(batch_size)
+        for _ in range(MAX_REDRAWS if n_steps else 0):
+            ends[wrong] = np.random.randint(n_steps, size=len(wrong))
             whole = self._age.take(ends) >= horizon - 1
-            return whole & ((ends // self.n_envs - self.pos) % self.buffer_size >= horizon - 1) if self.full else whole
-
-        # Most steps do. Those that do not are drawn again, without a look at all the others.
-        ends = np.random.randint(n_steps, size=batch_size) if n_steps else np.zeros(0, np.int64)
-        for _ in range(MAX_REDRAWS):
-            again = np.flatnonzero(~are_whole(ends))
-            if not len(again):
+            if self.full:
+                whole &= (ends // self.n_envs - self.pos) % self.buffer_size >= horizon - 1
+            wrong = np.flatnonzero(~whole)
+            if not len(wrong):
                 break
-            ends[again] = np.random.randint(n_steps, size=len(again))
         else:
-            ends = np.flatnonzero(are_whole(np.arange(n_steps)))
-            ends = ends[np.random.randint(len(ends), size=batch_size)] if len(ends) else ends
-        if not len(ends):
-            raise NoWindowError(f"no episode in the replay buffer spans {horizon} agent steps yet")
+            whole = self._age[: self.size()] >= horizon - 1
+            if self.full:
+                oldest = np.arange(min(horizon - 1, self.buffer_size))
+                whole[(self.pos + oldest) % self.buffer_size] = False
+            every = np.flatnonzero(whole)
+            if not len(every):
+                raise NoWindowError(f"no episode in the replay buffer spans {horizon} agent steps yet")
+            ends = every[np.random.randint(len(every), size=batch_size)]
         positions, envs = np.divmod(ends, self.n_envs)
         return positions, envs
 

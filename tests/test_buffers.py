@@ -1,5 +1,6 @@
 """WindowReplayBuffer against whole trajectories kept in plain lists, and against SB3's own buffers."""
 
+import contextlib
 import copy
 import io
 import pickle
@@ -21,6 +22,7 @@ from scipy.stats import chisquare
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecExtractDictObs, VecFrameStack, VecNormalize, VecTransposeImage
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, detect_frame_stack
 
@@ -818,6 +820,60 @@ def test_drawing_from_a_gpu_does_not_wait_for_it(crop_size, padding):
     for here, there in zip(*drawn, strict=True):
         assert (here is None) == (there is None)  # discounts
         assert here is None or (there.device.type, there.shape, there.dtype) == ("meta", here.shape, here.dtype)
+
+
+class _Copies(TorchDispatchMode):
+    """Whether copies to a device are waited for, by what they are of."""
+
+    def __init__(self):
+        super().__init__()
+        self.waits = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        if "_to_copy" in str(function):
+            self.waits.append(not kwargs.get("non_blocking"))
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(("storage", "device"), [("meta", "cpu"), (None, "meta"), ("cpu", "meta")])
+def test_a_copy_to_or_from_what_is_no_gpu_is_waited_for(storage, device):
+    """Else main memory is read before a copy has come, or written to while one is still under way."""
+    buffer = image_buffer(1, storage_device=storage)
+    buffer.device = th.device(device)
+    with _Copies() as copies, pytest.raises(NotImplementedError) if storage == "meta" else contextlib.nullcontext():
+        buffer.sample(5)
+    assert copies.waits and all(copies.waits)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, list])
+def test_positions_may_be_any_integers(kind):
+    buffer = make_buffer(300, n_envs=3)
+    filled(buffer, 90, LIFE, stack=1, padding="repeat")
+    positions = np.array([3, 70, 89])
+    drawn = []
+    for which in (positions, positions.tolist() if kind is list else positions.astype(kind)):
+        np.random.seed(0)
+        drawn.append(buffer._get_samples(which)._asdict())
+    assert_same(*drawn)
+
+
+@pytest.mark.filterwarnings("ignore:To copy construct from a tensor")
+def test_to_torch_takes_what_sb3s_takes():
+    ours, sb3 = make_buffer(20), ReplayBuffer(20, VECTOR, ACTIONS, "cpu")
+    for value in (1.5, (1, 2), [[True]], np.float64(3), np.arange(3.0), th.arange(3)):
+        for is_copied in (False, True):
+            one, other = (buffer.to_torch(value, is_copied) for buffer in (ours, sb3))
+            assert one.dtype == other.dtype and th.equal(one, other)
+
+
+def test_observations_of_no_numbers():
+    space = spaces.Dict({"nothing": spaces.Box(-1, 1, (0,), np.float32), "some": VECTOR})
+    buffer = WindowReplayBuffer(10, space, ACTIONS, "cpu")
+    obs = {"nothing": np.zeros((1, 0), np.float32), "some": np.ones((1, 3), np.float32)}
+    for i in range(12):
+        buffer.add(obs, obs, np.zeros((1, 2)), np.zeros(1), np.array([i % 4 == 3]), [{}])
+    assert buffer.sample(5).observations["nothing"].shape == (5, 0)
+    assert buffer.sample_windows(0, 2).actions.shape == (0, 2, 2)
 
 
 def test_memory_of_batches_is_used_again_once_nobody_has_them():

@@ -907,6 +907,33 @@ def test_a_copy_that_comes_too_late_takes_another_place(monkeypatch: pytest.Monk
     assert place_of(study.trials[late.number]) == (1, 1)
 
 
+@pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
+def test_a_copy_of_a_trial_whose_candidate_has_failed_since_takes_another_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    study, _ = heartbeat_study(monkeypatch)
+    study._storage.set_trial_state_values(study.ask()._trial_id, TrialState.FAIL)
+    faster = study.ask()
+    suggest_aux_loss(faster, 2)
+    study.tell(faster, state=TrialState.FAIL)
+    RetryHeartbeatStaleTrialCallback()(study, study.trials[0])
+    study.ask()
+    claims = [trial.system_attrs[PLACE_KEY] for trial in study.trials]
+    assert [(claim["stage"], claim["place"], claim["attempt"]) for claim in claims] == [(1, 0, 0), (1, 0, 0), (1, 0, 1)]
+    assert claims[2]["loss"] != claims[1]["loss"]
+
+
+@pytest.mark.parametrize("n_trials", [0, 1])
+def test_a_worker_that_is_interrupted_while_it_draws_decides_no_seed(n_trials: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As long as nobody has a place, the first trial's worker chooses the seed of the study."""
+    study = make_study(seed=None)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(module._Evolution, "candidate", lambda *arguments: (_ for _ in ()).throw(KeyboardInterrupt))
+        study.ask()
+    assert not study.sampler._register.holders
+    for _ in range(n_trials):
+        study.ask()
+    assert bool(study.sampler._register.holders) == bool(n_trials)
+
+
 @pytest.mark.parametrize("pruner", [MedianPruner(n_startup_trials=3), HyperbandPruner(min_resource=1, max_resource=9)])
 def test_pruned_trials_fill_their_place_and_are_no_parents_of_the_next_stage(pruner: optuna.pruners.BasePruner) -> None:
     study = make_study()
