@@ -10,7 +10,9 @@ environment steps each, one gradient step for each agent step of 4 environment s
 import argparse
 import multiprocessing
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from threading import BrokenBarrierError
 from typing import Any
 
 import torch as th
@@ -25,15 +27,27 @@ CANDIDATES = 700
 GRADIENT_STEPS = 500_000 // 4
 
 
-def train(setting: str, device: str, mode: str, threads: int, seconds: float, barrier: Any, queue: Any) -> None:
+barrier: Any = None  # of each worker
+
+
+def begin(shared: Any) -> None:
+    global barrier
+    barrier = shared
+
+
+def rate(setting: str, device: str, mode: str, threads: int, seconds: float) -> float:
     """One process: gradient steps a second while all others train too."""
-    th.set_num_threads(threads)
-    model = ours(setting, device, **modes(device)[mode])
-    model.set_logger(configure(None, []))
-    fill(model, 2000)
-    model.train(10 if device == "cuda" else 2, BATCH[setting])
-    synchronize(device)
-    barrier.wait()
+    try:
+        th.set_num_threads(threads)
+        model = ours(setting, device, **modes(device)[mode])
+        model.set_logger(configure(None, []))
+        fill(model, 2000)
+        model.train(10 if device == "cuda" else 2, BATCH[setting])
+        synchronize(device)
+        barrier.wait(timeout=300)
+    except Exception:
+        barrier.abort()  # nobody waits for this one
+        raise
     started = time.perf_counter()
     steps = 0
     # Nobody stops before all are done: the last ones would have the machine to themselves.
@@ -41,21 +55,23 @@ def train(setting: str, device: str, mode: str, threads: int, seconds: float, ba
         model.train(20 if device == "cuda" else 2, BATCH[setting])
         synchronize(device)
         steps += 20 if device == "cuda" else 2
-    queue.put(steps / (time.perf_counter() - started))
+    return steps / (time.perf_counter() - started)
 
 
 def total(setting: str, device: str, mode: str, processes: int, threads: int, seconds: float) -> float:
-    """Gradient steps a second of all processes together."""
+    """
+    Gradient steps a second of all processes together.
+
+    :raises Exception: that of a process that failed, as when they do not fit into the GPU's memory
+    """
     context = multiprocessing.get_context("spawn")
-    barrier, queue = context.Barrier(processes), context.Queue()
-    arguments = (setting, device, mode, threads, seconds, barrier, queue)
-    workers = [context.Process(target=train, args=arguments, daemon=True) for _ in range(processes)]
-    for worker in workers:
-        worker.start()
-    rates = [queue.get(timeout=300) for _ in workers]
-    for worker in workers:
-        worker.join()
-    return sum(rates)
+    shared = context.Barrier(processes)
+    with ProcessPoolExecutor(processes, context, initializer=begin, initargs=(shared,)) as pool:
+        futures = [pool.submit(rate, setting, device, mode, threads, seconds) for _ in range(processes)]
+    errors = [error for future in futures if (error := future.exception()) is not None]
+    if errors:
+        raise next((error for error in errors if not isinstance(error, BrokenBarrierError)), errors[0])
+    return sum(future.result() for future in futures)
 
 
 def main() -> None:
@@ -77,14 +93,18 @@ def main() -> None:
         for mode in args.modes:
             for processes in args.processes:
                 threads = max(1, args.cores // processes)
-                rate = total(setting, args.device, mode, processes, threads, args.seconds)
-                hours = CANDIDATES * GRADIENT_STEPS / rate / 3600
-                keys = ("setting", "mode", "processes", "threads", "steps_per_second", "search_hours")
-                rows.append(dict(zip(keys, (setting, mode, processes, threads, rate, hours), strict=True)))
-                table.add_row(setting, mode, str(processes), str(threads), f"{rate:,.1f}", f"{hours:,.0f}")
+                row = {"setting": setting, "mode": mode, "processes": processes, "threads": threads}
+                try:
+                    steps = total(setting, args.device, mode, processes, threads, args.seconds)
+                    hours = CANDIDATES * GRADIENT_STEPS / steps / 3600
+                    rows.append({**row, "steps_per_second": steps, "search_hours": hours})
+                    table.add_row(*map(str, row.values()), f"{steps:,.1f}", f"{hours:,.0f}")
+                except Exception as error:
+                    rows.append({**row, "error": f"{type(error).__name__}: {error}"})
+                    table.add_row(*map(str, row.values()), type(error).__name__, "")
+                if args.out:  # after each row: a device may be taken away
+                    save_result(args.out, device=args.device, rows=rows)
     Console(width=120).print(table)
-    if args.out:
-        save_result(args.out, device=args.device, rows=rows)
 
 
 if __name__ == "__main__":

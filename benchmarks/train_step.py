@@ -18,6 +18,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -124,9 +125,12 @@ def synchronize(device: str) -> None:
 
 
 def peak(device: str, dtype: th.dtype, batch: int) -> float:
-    """Floating point operations a second of the product that dominates a step: (batch, 1024) x (1024, 1024)."""
-    one, other = th.randn(batch, 1024, device=device).to(dtype), th.randn(1024, 1024, device=device).to(dtype)
-    n = 200 if device == "cuda" else 5
+    """
+    Floating point operations a second of the product that dominates a step: (batch, 1024) x (1024, 1024). On a GPU, where
+    Python would take longer than that, of a large one.
+    """
+    batch, width, n = (8192, 8192, 20) if device == "cuda" else (batch, 1024, 5)
+    one, other = th.randn(batch, width, device=device).to(dtype), th.randn(width, width, device=device).to(dtype)
     seconds = []
     for _ in range(10):
         started = time.perf_counter()
@@ -134,7 +138,7 @@ def peak(device: str, dtype: th.dtype, batch: int) -> float:
             one @ other
         synchronize(device)
         seconds.append((time.perf_counter() - started) / n)
-    return 2 * batch * 1024 * 1024 / min(seconds)
+    return 2 * batch * width * width / min(seconds)
 
 
 def flops(model: SAC, steps: int = 4) -> float:
@@ -188,7 +192,9 @@ def parts(model: SACAux, device: str, steps: int) -> dict[str, float]:
     return {part: 1e3 * value / steps for part, value in seconds.items()}
 
 
-def measure(setting: str, device: str, variants: dict[str, dict[str, Any]], rounds: int, steps: int) -> list[dict[str, Any]]:
+def measure(
+    setting: str, device: str, variants: dict[str, dict[str, Any]], rounds: int, steps: int, at_once: int = 1
+) -> list[dict[str, Any]]:
     models: dict[str, SAC] = {"SB3 SAC": sb3(setting, device)}
     models |= {name: ours(setting, device, **kwargs) for name, kwargs in variants.items()}
     for model in models.values():
@@ -200,9 +206,10 @@ def measure(setting: str, device: str, variants: dict[str, dict[str, Any]], roun
         for name, model in models.items():
             synchronize(device)
             started = time.perf_counter()
-            model.train(steps, model.batch_size)
+            for _ in range(steps // at_once):
+                model.train(at_once, model.batch_size)
             synchronize(device)
-            seconds[name].append((time.perf_counter() - started) / steps)
+            seconds[name].append((time.perf_counter() - started) / (steps // at_once * at_once))
     rows = []
     for name, model in models.items():
         bf16 = getattr(model, "precision", "fp32") == "bf16"
@@ -215,7 +222,8 @@ def measure(setting: str, device: str, variants: dict[str, dict[str, Any]], roun
         }
         if getattr(model, "compile", None) is None:
             row["gflop"] = flops(model) / 1e9
-            row["peak_gflops"] = peak(device, th.bfloat16 if bf16 else th.float32, BATCH[setting]) / 1e9
+            with model._gpu_settings() if isinstance(model, SACAux) else nullcontext():  # TF32 or not
+                row["peak_gflops"] = peak(device, th.bfloat16 if bf16 else th.float32, BATCH[setting]) / 1e9
             row["share_of_peak"] = row["gflop"] / row["peak_gflops"] / (row["ms"] / 1e3)
             if isinstance(model, SACAux):
                 row["parts_ms"] = parts(model, device, 2 * steps)
@@ -252,6 +260,9 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if th.cuda.is_available() else "cpu", choices=["cpu", "cuda"])
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--steps", type=int, help="gradient steps of each algorithm in a round")
+    parser.add_argument(
+        "--at-once", type=int, default=1, help="gradient steps in a call of train(); learn() makes one in each"
+    )
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
@@ -259,7 +270,7 @@ def main() -> None:
     rows = []
     for setting in args.settings:
         steps = args.steps or (200 if args.device == "cuda" else {"state": 6, "pixels": 2}[setting])
-        rows += measure(setting, args.device, variants, args.rounds, steps)
+        rows += measure(setting, args.device, variants, args.rounds, steps, args.at_once)
         show(rows)
     if args.out:
         save_result(args.out, threads=th.get_num_threads(), rows=rows)

@@ -1,7 +1,9 @@
 """A gradient step as CUDA graphs: recorded once, then launched as a whole instead of some hundred kernels one by one."""
 
 import copy
+import gc
 import logging
+import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
@@ -19,7 +21,8 @@ WARMUP_STEPS = 3
 class _Recording(NamedTuple):
     graph: th.cuda.CUDAGraph
     inputs: list[th.Tensor]
-    outputs: dict[str, th.Tensor]
+    names: list[str]
+    values: th.Tensor  # one for each name
 
 
 class GraphedStep:
@@ -53,7 +56,9 @@ class GraphedStep:
         self.seen[key] += 1
         if self.seen[key] <= WARMUP_STEPS:
             self.stream.wait_stream(th.cuda.current_stream())
-            with th.cuda.stream(self.stream):
+            with th.cuda.stream(self.stream), warnings.catch_warnings():
+                # Optimizers that can be captured warn as long as they are not.
+                warnings.filterwarnings("ignore", "This instance was constructed with capturable=True")
                 outputs = self.step(*arguments)
             th.cuda.current_stream().wait_stream(self.stream)
             return outputs
@@ -61,26 +66,42 @@ class GraphedStep:
             try:
                 self.recordings[key] = self._record(arguments)
             except RuntimeError as error:
-                logger.warning("No CUDA graph, the gradient step runs kernel by kernel: %s", str(error).splitlines()[0])
+                cause: BaseException = error
+                while cause.__context__ is not None:  # what ends a recording only says that it was broken off
+                    cause = cause.__context__
+                reason = str(cause).partition("\n")[0] or type(cause).__name__
+                logger.warning("No CUDA graph, the gradient step runs kernel by kernel: %s", reason)
                 self.works = False
                 self.recordings.clear()
                 try:
                     return self.step(*arguments)
                 except RuntimeError as consequence:
                     # Some versions of PyTorch leave their random generator in the recording that was broken off.
-                    raise RuntimeError("recording a CUDA graph failed for good: train with compile=None") from consequence
-        graph, inputs, outputs = self.recordings[key]
+                    raise RuntimeError(
+                        "recording a CUDA graph failed for good: train in a new process, with compile=None"
+                    ) from consequence
+        graph, inputs, names, values = self.recordings[key]
         th._foreach_copy_(inputs, list(_leaves(arguments)))
         graph.replay()
-        # The next replay writes the outputs anew.
-        return {name: value.clone() for name, value in outputs.items()}
+        # The next replay writes the values anew.
+        return dict(zip(names, values.clone().unbind(), strict=True))
 
     def _record(self, arguments: tuple[Any, ...]) -> _Recording:
         static = _map(th.clone, arguments)
         graph = th.cuda.CUDAGraph()
-        with unchecked_distributions(), th.cuda.graph(graph, stream=self.stream):
-            outputs = self.step(*static)
-        return _Recording(graph, list(_leaves(static)), outputs)
+        # Garbage may be the graphs of another model: collected while this one is recorded, they would break it off.
+        gc.collect()
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            # The stream is set here too: PyTorch does not set it back where a recording fails.
+            with unchecked_distributions(), th.cuda.stream(self.stream), th.cuda.graph(graph, stream=self.stream):
+                outputs = self.step(*static)
+                values = th.stack(list(outputs.values()))
+        finally:
+            if collects:
+                gc.enable()
+        return _Recording(graph, list(_leaves(static)), list(outputs), values)
 
 
 @contextmanager

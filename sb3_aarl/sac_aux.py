@@ -1,11 +1,13 @@
 """SACAux: Soft Actor-Critic whose encoder is also trained with an auxiliary loss."""
 
+import copy
 import io
 import logging
 import pathlib
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from itertools import islice
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -422,12 +424,15 @@ class SACAux(SAC):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/aux_skipped", self._n_aux_skipped)
         first = self._n_updates - gradient_steps + 1
-        if rewards:
-            self._largest_reward = max(self._largest_reward, th.stack(rewards).max().item())
+        # In one piece: a GPU is waited for once.
+        shown = [*rewards, *(value for log in logs for value in log.values())]
+        numbers = iter(th.stack(shown).cpu().numpy() if shown else ())
+        self._largest_reward = float(max([self._largest_reward, *islice(numbers, len(rewards))]))
+        found = [{name: next(numbers) for name in log} for log in logs]
         ent_coef = 0.0
-        for name in dict.fromkeys(name for log in logs for name in log):
-            steps = [first + i for i, log in enumerate(logs) if name in log]
-            values = th.stack([log[name] for log in logs if name in log]).cpu().numpy()
+        for name in dict.fromkeys(name for log in found for name in log):
+            steps = [first + i for i, log in enumerate(found) if name in log]
+            values = np.array([log[name] for log in found if name in log])
             if not np.isfinite(values).all():
                 wrong = int(np.flatnonzero(~np.isfinite(values))[0])
                 raise NonFiniteError(f"{name} is {values[wrong]} at {self._step_and_loss(steps[wrong])}")
@@ -623,8 +628,10 @@ class SACAux(SAC):
             for group in optimizer.param_groups:
                 if group.get("capturable", graphed) != graphed:  # of a model that was saved in the other mode
                     group["capturable"] = graphed
+                    # Where else Adam counts its steps.
+                    device = self.device if graphed or group.get("fused") else "cpu"
                     for state in optimizer.state.values():
-                        state["step"] = state["step"].to(self.device)
+                        state["step"] = state["step"].to(device)
                 if not graphed:
                     group["lr"] = schedule(progress)
                 elif isinstance(group["lr"], th.Tensor):
@@ -824,7 +831,10 @@ class SACAux(SAC):
         :param device: Device of the parameters
         :raises ParametersError: when they are of a model with other settings
         """
-        if not isinstance(load_path_or_dict, dict):
+        if isinstance(load_path_or_dict, dict):
+            # PyTorch's optimizers take the tensors themselves: of another model's, both would go on.
+            load_path_or_dict = copy.deepcopy(load_path_or_dict)
+        else:
             load_path_or_dict = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
         if ("aux_head" in load_path_or_dict) > (self.aux_head is not None):
             raise ParametersError(

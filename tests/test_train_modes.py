@@ -1,21 +1,27 @@
 """The gradient step in bfloat16, as a CUDA graph, with fused optimizers, from storage elsewhere: still the same step."""
 
+import contextlib
 import copy
+import gc
 import logging
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
 from test_sac_aux import KINDS, LOSS, assert_same, everything, filled_model, make_model
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.optim import adam
+from torch.utils._python_dispatch import TorchDispatchMode, _get_current_dispatch_mode
+from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_aarl import sac_aux
+from sb3_aarl import cuda_graph, sac_aux
 from sb3_aarl.aux_loss import OPERATORS
-from sb3_aarl.cuda_graph import _key, _leaves, _map, unchecked_distributions
+from sb3_aarl.cuda_graph import GraphedStep, _key, _leaves, _map, unchecked_distributions
+from sb3_aarl.policies import Critic
 from sb3_aarl.sac_aux import NonFiniteError
 
 PRODUCTS = {"aten.mm", "aten.addmm", "aten.convolution", "aten.convolution_backward"}
@@ -285,11 +291,164 @@ def test_a_model_whose_images_were_laid_out_in_another_way_is_refused() -> None:
         model.set_parameters(parameters)
 
 
+class Tape(TorchDispatchMode):
+    """
+    What a CUDA graph is, of operations on the CPU: those in its context are taken down and, unlike a GPU's, done and undone.
+    A replay does them again on the very same tensors, so that whatever Python decided in between stays as it was.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations: list[tuple[Any, Any, Any, Any]] = []
+        self.before: dict[int, tuple[th.Tensor, th.Tensor]] = {}
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        for argument, value in zip(function._schema.arguments, args, strict=False):
+            if argument.alias_info is not None and argument.alias_info.is_write:
+                for tensor in tree_leaves(value):
+                    self.before.setdefault(id(tensor), (tensor, tensor.clone()))
+        result = function(*args, **kwargs)
+        self.operations.append((function, args, kwargs, result))
+        return result
+
+    def __enter__(self) -> Any:
+        self.random_state = th.get_rng_state()
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        for tensor, before in reversed(self.before.values()):
+            tensor.detach().copy_(before)
+        th.set_rng_state(self.random_state)
+
+    @th.no_grad()
+    def replay(self) -> None:
+        for function, args, kwargs, result in self.operations:
+            for old, new in zip(tree_leaves(result), tree_leaves(function(*args, **kwargs)), strict=True):
+                if isinstance(old, th.Tensor) and old.data_ptr() != new.data_ptr():  # neither a view nor what was written to
+                    old.detach().copy_(new)
+
+
+@pytest.fixture
+def tapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``compile="cudagraphs"`` on the CPU, with tapes in place of graphs."""
+    for name in ("device", "stream"):
+        monkeypatch.setattr(th.cuda, name, lambda *arguments: contextlib.nullcontext())
+    for name in ("Stream", "current_stream"):
+        monkeypatch.setattr(th.cuda, name, lambda *arguments: SimpleNamespace(wait_stream=lambda other: None))
+    monkeypatch.setattr(th.cuda, "CUDAGraph", Tape)
+    monkeypatch.setattr(th.cuda, "graph", lambda graph, stream: graph)
+    monkeypatch.setattr(adam, "_get_capturable_supported_devices", lambda: ["cpu"])
+    # As on a GPU: which rows have a gradient is data that Python would look at.
+    plain = Critic.min_q_values
+    monkeypatch.setattr(Critic, "min_q_values", lambda self, *inputs, skip_rows: plain(self, *inputs, skip_rows=False))
+
+
+def taped_model(kind: str = "state", **kwargs: Any) -> Any:
+    model = filled_model(kind, **kwargs)
+    model._graphed_step = GraphedStep(model._gradient_step, model.device)
+    return model
+
+
+@pytest.mark.usefixtures("tapes")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"precision": "bf16"},
+        {"joint_optimizer": True},
+        {"ent_coef": 0.1},
+        {"policy_delay": 3, "target_update_interval": 2},
+    ],
+    ids=str,
+)
+def test_a_recorded_step_is_the_eager_step(kind: str, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over 30 steps; nothing that changes from step to step, as the learning rate, is recorded as a number."""
+    states, logs = [], []
+    for warmup_steps in (1000, cuda_graph.WARMUP_STEPS):
+        monkeypatch.setattr(cuda_graph, "WARMUP_STEPS", warmup_steps)
+        model = taped_model(kind, learning_rate=lambda left: 1e-3 * left, **settings)
+        np.random.seed(0)
+        th.manual_seed(0)
+        for i in range(10):
+            model._current_progress_remaining = 1 - i / 20
+            model.train(3, batch_size=16)
+        for optimizer, schedule in model._optimizers().items():
+            assert optimizer.param_groups[0]["lr"].item() == pytest.approx(schedule(1 - i / 20))
+        states.append(copy.deepcopy(everything(model)))
+        logs.append(dict(model.logger.name_to_value))
+    assert model._graphed_step.works and len(model._graphed_step.recordings) >= 2
+    assert len(model._graphed_step.recordings) == len(model._graphed_step.seen)
+    assert_same(logs[1], logs[0])
+    assert_same(states[1], states[0])
+
+
+@pytest.mark.usefixtures("tapes")
+def test_parameters_that_are_set_reach_what_is_recorded() -> None:
+    eager, taped = filled_model(), taped_model()
+    for model in (eager, taped):
+        model.train(12, batch_size=16)
+    assert taped._graphed_step.recordings
+    parameters = copy.deepcopy(eager.get_parameters())
+    for model in (eager, taped):
+        model.set_parameters(parameters)
+        np.random.seed(0)
+        th.manual_seed(0)
+        model.train(12, batch_size=16)
+    for name, value in everything(eager).items():
+        if isinstance(value, th.Tensor):
+            th.testing.assert_close(everything(taped)[name], value, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.usefixtures("tapes")
+def test_what_cannot_be_recorded_runs_as_it_is(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(Tape):
+        def __exit__(self, *error: Any) -> None:
+            super().__exit__(*error)
+            if error[0] is not None:
+                raise RuntimeError("a recording was broken off")
+
+    monkeypatch.setattr(th.cuda, "CUDAGraph", Broken)
+    model, eager = taped_model(), filled_model()
+    step = model._gradient_step
+
+    def waits(*arguments: Any) -> dict[str, th.Tensor]:
+        logs = step(*arguments)
+        if isinstance(_get_current_dispatch_mode(), Broken):
+            raise RuntimeError("somebody waits\nfor the GPU")
+        return logs
+
+    model._graphed_step.step = waits
+    for each in (model, eager):
+        np.random.seed(0)
+        th.manual_seed(0)
+        each.train(12, batch_size=16)
+    assert [record.getMessage() for record in caplog.records] == [
+        "No CUDA graph, the gradient step runs kernel by kernel: somebody waits"
+    ]
+    assert gc.isenabled()
+    for name, value in everything(eager).items():
+        if isinstance(value, th.Tensor):
+            th.testing.assert_close(everything(model)[name], value, rtol=1e-4, atol=1e-5)
+
+
+def test_two_models_with_one_s_parameters_go_on_by_themselves() -> None:
+    one, other = filled_model(), filled_model()
+    one.train(4, batch_size=16)
+    other.set_parameters(one.get_parameters())
+    before = everything(one)
+    other.train(4, batch_size=16)
+    assert_same(everything(one), before)
+
+
 @needs_cuda
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
-def test_a_cuda_graph_is_the_eager_step(kind: str, precision: str) -> None:
+def test_a_cuda_graph_is_the_eager_step(kind: str, precision: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over 20 steps with the same data and the same noise; also with a learning rate that changes."""
+    monkeypatch.setattr(th.backends.cudnn, "deterministic", True)
     states = []
     for mode in (None, "cudagraphs"):
         model = filled_model(
@@ -312,7 +471,9 @@ def test_parameters_that_are_set_reach_the_graph() -> None:
     models = [filled_model(compile=mode, device="cuda", allow_tf32=False) for mode in (None, "cudagraphs")]
     for model in models:
         model.train(12, batch_size=16)
-        model.set_parameters(models[0].get_parameters())
+    parameters = copy.deepcopy(models[0].get_parameters())
+    for model in models:
+        model.set_parameters(parameters)
         np.random.seed(0)
         th.manual_seed(0)
         model.train(12, batch_size=16)
