@@ -10,6 +10,7 @@ environment steps each, one gradient step for each agent step of 4 environment s
 import argparse
 import multiprocessing
 import time
+import traceback
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from threading import BrokenBarrierError
@@ -99,7 +100,8 @@ def main() -> None:
                     hours = CANDIDATES * GRADIENT_STEPS / steps / 3600
                     rows.append({**row, "steps_per_second": steps, "search_hours": hours})
                     table.add_row(*map(str, row.values()), f"{steps:,.1f}", f"{hours:,.0f}")
-                except Exception as error:
+                except Exception as error:  # out of memory, mostly: the other rows are worth having
+                    traceback.print_exc()
                     rows.append({**row, "error": f"{type(error).__name__}: {error}"})
                     table.add_row(*map(str, row.values()), type(error).__name__, "")
                 if args.out:  # after each row: a device may be taken away

@@ -206,10 +206,11 @@ def measure(
         for name, model in models.items():
             synchronize(device)
             started = time.perf_counter()
-            for _ in range(steps // at_once):
+            calls = max(1, steps // at_once)
+            for _ in range(calls):
                 model.train(at_once, model.batch_size)
             synchronize(device)
-            seconds[name].append((time.perf_counter() - started) / (steps // at_once * at_once))
+            seconds[name].append((time.perf_counter() - started) / (calls * at_once))
     rows = []
     for name, model in models.items():
         bf16 = getattr(model, "precision", "fp32") == "bf16"

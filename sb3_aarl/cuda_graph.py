@@ -3,6 +3,7 @@
 import copy
 import gc
 import logging
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
@@ -30,7 +31,8 @@ class GraphedStep:
     A function of tensors and flags that changes parameters in place, recorded as one CUDA graph for each combination of
     flags and shapes. Where it cannot be recorded one line of log says why, and it runs as it is from then on.
 
-    :param step: From nested tuples and dicts of tensors, None, and flags, to scalars by name. It must not wait for the GPU
+    :param step: From nested tuples and dicts of tensors, None, and flags, to scalars of one dtype by name, at least one. It
+        must not wait for the GPU
     :param device: The CUDA device of all tensors
     """
 
@@ -63,12 +65,12 @@ class GraphedStep:
             th.cuda.current_stream().wait_stream(self.stream)
             return outputs
         if key not in self.recordings:
+            handled = sys.exc_info()[1]  # by whoever trains in an except clause
             try:
                 self.recordings[key] = self._record(arguments)
             except RuntimeError as error:
-                cause: BaseException = error
-                while cause.__context__ is not None:  # what ends a recording only says that it was broken off
-                    cause = cause.__context__
+                # What ends a recording only says that it was broken off.
+                cause = error if error.__context__ in (None, handled) else error.__context__
                 reason = str(cause).partition("\n")[0] or type(cause).__name__
                 logger.warning("No CUDA graph, the gradient step runs kernel by kernel: %s", reason)
                 self.works = False

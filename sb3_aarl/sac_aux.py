@@ -628,7 +628,7 @@ class SACAux(SAC):
             for group in optimizer.param_groups:
                 if group.get("capturable", graphed) != graphed:  # of a model that was saved in the other mode
                     group["capturable"] = graphed
-                    # Where else Adam counts its steps.
+                    # Adam keeps it on the CPU unless it is capturable or fused.
                     device = self.device if graphed or group.get("fused") else "cpu"
                     for state in optimizer.state.values():
                         state["step"] = state["step"].to(device)
@@ -832,8 +832,10 @@ class SACAux(SAC):
         :raises ParametersError: when they are of a model with other settings
         """
         if isinstance(load_path_or_dict, dict):
-            # PyTorch's optimizers take the tensors themselves: of another model's, both would go on.
-            load_path_or_dict = copy.deepcopy(load_path_or_dict)
+            # PyTorch's optimizers take the tensors themselves, and would go on with those of another model.
+            load_path_or_dict = {
+                name: copy.deepcopy(state) if "optimizer" in name else state for name, state in load_path_or_dict.items()
+            }
         else:
             load_path_or_dict = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
         if ("aux_head" in load_path_or_dict) > (self.aux_head is not None):

@@ -142,11 +142,14 @@ class _Register:
         holders = [self.trials[number] for number in self.holders.get((stage, place), ())]
         return [trial for trial in holders if trial.state in FILLED + OPEN and not _is_invalid(trial)]
 
-    def keeps_place(self, number: int, retries: int) -> bool:
-        """Whether a copy of a trial whose worker died has its place still: nobody else took it, or failed there since."""
-        claim = self.trials[number].system_attrs[PLACE_KEY]
-        is_due = claim["loss"] is None or claim["attempt"] == self.attempt(*self.places[number], retries)
-        return is_due and all(holder.number == number for holder in self.held_by(*self.places[number]))
+    def is_shared(self, number: int) -> bool:
+        """Whether another trial has the place of this one."""
+        return any(holder.number != number for holder in self.held_by(*self.places[number]))
+
+    def is_given_up(self, number: int, retries: int) -> bool:
+        """Whether the candidate of a copy failed since its trial died. One that has its parameters can get no other."""
+        claim, params = self.trials[number].system_attrs[PLACE_KEY], self.trials[number].params
+        return claim["loss"] is not None and not params and claim["attempt"] < self.attempt(*self.places[number], retries)
 
     def attempt(self, stage: int, place: int, retries: int) -> int:
         """How many candidates of the place were given up because they failed, or their workers died too often."""
@@ -346,10 +349,10 @@ class AuxLossSampler(BaseGASampler):
             self._refresh(study)
             register = self._register
             first = min((n for n in register.open if register.trials[n].state == TrialState.WAITING), default=None)
-            if first in register.places and register.keeps_place(first, self.retries):
-                return True  # a copy of a trial whose worker died is next
+            if first in register.places and not register.is_shared(first):
+                return True  # a copy of a trial whose worker died is next, and nobody has taken its place
             # Before the first trial chose, the seed of the study may still be open.
-            return not register.holders or self._nth_free(study, len(register.unplaced())) is not None
+            return not register.places or self._nth_free(study, len(register.unplaced())) is not None
 
     # Optuna's interface.
 
@@ -486,10 +489,10 @@ class AuxLossSampler(BaseGASampler):
                 ahead = [] if is_copy else register.unplaced(before=trial.number)
                 free = None
                 if is_copy:
-                    if register.keeps_place(trial.number, self.retries):
+                    if not (register.is_shared(trial.number) or register.is_given_up(trial.number, self.retries)):
                         return wait.end()
                     self._give_back(study, trial)
-                elif not ahead or register.holders:  # who chooses first may bring the study's seed
+                elif not ahead or register.places:  # who chooses first may bring the study's seed
                     is_given = bool(trial.params) or FIXED_KEY in trial.system_attrs
                     free = self._nth_free(study, len(ahead), is_given)
                     if free is not None and self._take(study, trial, *free, is_given):
@@ -527,7 +530,7 @@ class AuxLossSampler(BaseGASampler):
     def _take(self, study: Study, trial: FrozenTrial, stage: int, place: int, is_given: bool) -> bool:
         """Take a place for a trial; False if another one has it too."""
         evolution = self._get_evolution(study)
-        before = list(self._register.holders.get((stage, place), ()))
+        before = list(self._register.holders[stage, place])
         attempt = self._register.attempt(stage, place, self.retries)
         operation, loss = "enqueued", None
         parents: list[int] = []

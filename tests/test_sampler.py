@@ -908,17 +908,30 @@ def test_a_copy_that_comes_too_late_takes_another_place(monkeypatch: pytest.Monk
 
 
 @pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
-def test_a_copy_of_a_trial_whose_candidate_has_failed_since_takes_another_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    study, _ = heartbeat_study(monkeypatch)
-    study._storage.set_trial_state_values(study.ask()._trial_id, TrialState.FAIL)
+@pytest.mark.parametrize("has_params", [False, True])
+def test_a_copy_of_a_trial_whose_candidate_has_failed_since_gets_another(
+    has_params: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study, _ = heartbeat_study(monkeypatch, n_random=1, n_stages=1)
+    dead = study.ask()
+    if has_params:
+        suggest_aux_loss(dead, 2)
+    study._storage.set_trial_state_values(dead._trial_id, TrialState.FAIL)
     faster = study.ask()
     suggest_aux_loss(faster, 2)
     study.tell(faster, state=TrialState.FAIL)
     RetryHeartbeatStaleTrialCallback()(study, study.trials[0])
-    study.ask()
+    assert isinstance(study.sampler, AuxLossSampler) and study.sampler.has_place(study)
+    copied = study.ask()
     claims = [trial.system_attrs[PLACE_KEY] for trial in study.trials]
-    assert [(claim["stage"], claim["place"], claim["attempt"]) for claim in claims] == [(1, 0, 0), (1, 0, 0), (1, 0, 1)]
-    assert claims[2]["loss"] != claims[1]["loss"]
+    loss = str(suggest_aux_loss(copied, 2))
+    # Parameters that it was given already cannot be taken back.
+    assert [(claim["stage"], claim["place"], claim["attempt"]) for claim in claims] == [
+        (1, 0, 0),
+        (1, 0, 0),
+        (1, 0, not has_params),
+    ]
+    assert claims[2]["loss"] == loss and (loss == claims[1]["loss"]) == has_params
 
 
 @pytest.mark.parametrize("n_trials", [0, 1])
@@ -928,10 +941,10 @@ def test_a_worker_that_is_interrupted_while_it_draws_decides_no_seed(n_trials: i
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(module._Evolution, "candidate", lambda *arguments: (_ for _ in ()).throw(KeyboardInterrupt))
         study.ask()
-    assert not study.sampler._register.holders
+    assert not study.sampler._register.places
     for _ in range(n_trials):
         study.ask()
-    assert bool(study.sampler._register.holders) == bool(n_trials)
+    assert bool(study.sampler._register.places) == bool(n_trials)
 
 
 @pytest.mark.parametrize("pruner", [MedianPruner(n_startup_trials=3), HyperbandPruner(min_resource=1, max_resource=9)])
