@@ -97,6 +97,7 @@ def added(arguments: list[str]) -> dict[str, object]:
 def test_optimizes_what_rl_zoo_optimizes_of_sac(tmp_path: Path) -> None:
     pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
     trials = ["-optimize", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1", "--sampler", "random"]
+    trials += ["--pruner", "none"]  # RL-Zoo prunes trials that fail, and a pruner the second one if it is worse than the first
     settings = ["-n", "280", "--eval-episodes", "1", "--device", "cpu", "--seed", "3", "-params", "learning_starts:260"]
     run(tmp_path, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "aarl_state.yml"), *trials, *settings)
     (report,) = (tmp_path / "logs" / "sac_aux").glob("report_*.csv")
