@@ -51,7 +51,7 @@ def rate(setting: str, device: str, mode: str, threads: int, seconds: float) -> 
         raise
     started = time.perf_counter()
     steps = 0
-    # Nobody stops before all are done: the last ones would have the machine to themselves.
+    # All begin together and train for the same time: nobody has the machine to himself.
     while time.perf_counter() - started < seconds:
         model.train(20 if device == "cuda" else 2, BATCH[setting])
         synchronize(device)
