@@ -840,6 +840,7 @@ def test_a_copy_to_or_from_what_is_no_gpu_is_waited_for(storage, device):
     """Else main memory is read before a copy has come, or written to while one is still under way."""
     buffer = image_buffer(1, storage_device=storage)
     buffer.device = th.device(device)
+    # Out of meta nothing can be copied: that it was to be, and how, is known by then.
     with _Copies() as copies, pytest.raises(NotImplementedError) if storage == "meta" else contextlib.nullcontext():
         buffer.sample(5)
     assert copies.waits and all(copies.waits)

@@ -28,6 +28,12 @@ PRODUCTS = {"aten.mm", "aten.addmm", "aten.convolution", "aten.convolution_backw
 needs_cuda = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a CUDA device")
 
 
+def assert_near(given: dict[str, Any], expected: dict[str, Any], **tolerances: float) -> None:
+    for name, value in expected.items():
+        if isinstance(value, th.Tensor):
+            th.testing.assert_close(given[name], value, **tolerances)
+
+
 class Operations(TorchDispatchMode):
     """The data types that operations were given, by name."""
 
@@ -86,7 +92,7 @@ def test_bfloat16_is_what_networks_compute_in_and_nothing_else(kind: str) -> Non
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_bfloat16_gives_almost_the_same_gradients(kind: str) -> None:
-    lengths: dict[str, list[float]] = {}  # by how much those of gradients differ, of several networks and batches
+    of_encoders = []  # by how much the lengths of their gradients differ: mostly little, but in one of five networks by 5 %
     for seed in range(5):
         gradients, logs = [], []
         for precision in ("fp32", "bf16"):
@@ -105,10 +111,13 @@ def test_bfloat16_gives_almost_the_same_gradients(kind: str) -> None:
         for name, exact in gradients[0].items():
             assert th.cosine_similarity(exact, gradients[1][name], dim=0) > 0.995, name
             assert not th.equal(exact, gradients[1][name])
-            lengths.setdefault(name, []).append(abs(gradients[1][name].norm().item() / exact.norm().item() - 1))
+            if name == "encoder":
+                of_encoders.append(abs(exact.norm().item() / gradients[1][name].norm().item() - 1))
+            else:
+                assert exact.norm().item() == pytest.approx(gradients[1][name].norm().item(), rel=0.02), name
         for name, value in logs[0].items():
             assert logs[1][name] == pytest.approx(value, rel=0.02, abs=1e-3), name
-    assert {name: difference for name, differences in lengths.items() if (difference := np.median(differences)) > 0.02} == {}
+    assert np.median(of_encoders) < 0.02
 
 
 def test_bfloat16_predicts_and_is_saved_in_float32(tmp_path: Any) -> None:
@@ -397,9 +406,7 @@ def test_parameters_that_are_set_reach_what_is_recorded() -> None:
         np.random.seed(0)
         th.manual_seed(0)
         model.train(12, batch_size=16)
-    for name, value in everything(eager).items():
-        if isinstance(value, th.Tensor):
-            th.testing.assert_close(everything(taped)[name], value, rtol=1e-4, atol=1e-5)
+    assert_near(everything(taped), everything(eager), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.usefixtures("tapes")
@@ -435,9 +442,7 @@ def test_what_cannot_be_recorded_runs_as_it_is(
         "No CUDA graph, the gradient step runs kernel by kernel: somebody waits"
     ]
     assert gc.isenabled()
-    for name, value in everything(eager).items():
-        if isinstance(value, th.Tensor):
-            th.testing.assert_close(everything(model)[name], value, rtol=1e-4, atol=1e-5)
+    assert_near(everything(model), everything(eager), rtol=1e-4, atol=1e-5)
 
 
 def test_two_models_with_one_s_parameters_go_on_by_themselves() -> None:
@@ -467,9 +472,7 @@ def test_a_cuda_graph_is_the_eager_step(kind: str, precision: str, monkeypatch: 
             model.train(1, batch_size=16)
         states.append(copy.deepcopy(everything(model)))
         assert mode is None or (model._graphed_step.works and model._graphed_step.recordings)
-    for name, value in states[0].items():
-        if isinstance(value, th.Tensor):
-            th.testing.assert_close(states[1][name], value, rtol=1e-2, atol=1e-3)
+    assert_near(states[1], states[0], rtol=1e-2, atol=1e-3)
 
 
 @needs_cuda
@@ -483,9 +486,7 @@ def test_parameters_that_are_set_reach_the_graph() -> None:
         np.random.seed(0)
         th.manual_seed(0)
         model.train(12, batch_size=16)
-    for name, value in everything(models[0]).items():
-        if isinstance(value, th.Tensor):
-            th.testing.assert_close(everything(models[1])[name], value, rtol=1e-2, atol=1e-3)
+    assert_near(everything(models[1]), everything(models[0]), rtol=1e-2, atol=1e-3)
 
 
 @needs_cuda
