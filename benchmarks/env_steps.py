@@ -32,8 +32,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import LearningCurveCallback, SingleEpisodes
 from sb3_aarl.envs import make_dmc_env
-from search.config import VEC_ENVS
-from search.provenance import save_result
+from search.training.config import VEC_ENVS
+from search.training.provenance import save_result
 
 ACTION_REPEAT = 4
 EPISODES = 10

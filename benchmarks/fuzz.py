@@ -31,8 +31,9 @@ from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 from stable_baselines3.common.env_util import make_vec_env
 
-from search import checkpoint, training
-from search.provenance import save_result
+from search.training import checkpoint
+from search.training import run as training
+from search.training.provenance import save_result
 
 # Tries an input that it makes with a random generator, and says what it was and what came of it. What it raises is a bug.
 Attempt = Callable[[random.Random], tuple[str, str]]

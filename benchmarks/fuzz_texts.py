@@ -15,7 +15,8 @@ import numpy as np
 import yaml
 
 from sb3_aarl import AuxLoss, catalog
-from search import config, space
+from search.evolution import space
+from search.training import config
 
 # Seconds of processor time, and bytes of memory more than before, that one input may take.
 SECONDS = 5.0

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import LearningCurveCallback
 from sb3_aarl.envs import make_dmc_env
-from search.provenance import provenance
+from search.training.provenance import provenance
 
 
 class AuxLossRecorder(BaseCallback):

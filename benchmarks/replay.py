@@ -22,7 +22,7 @@ from rich.table import Table
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_aarl.buffers import WindowReplayBuffer
-from search.provenance import save_result
+from search.training.provenance import save_result
 
 IMAGES = spaces.Box(0, 255, (9, 100, 100), np.uint8)
 ACTIONS = spaces.Box(-1, 1, (6,), np.float32)

@@ -24,9 +24,9 @@ import optuna
 from scipy.stats import mannwhitneyu
 
 from sb3_aarl.aux_loss import AuxLoss, Token
-from search.provenance import save_result
-from search.sampler import AuxLossSampler
-from search.space import MAX_HORIZON, random_loss, suggest_aux_loss
+from search.evolution.sampler import AuxLossSampler
+from search.evolution.space import MAX_HORIZON, random_loss, suggest_aux_loss
+from search.training.provenance import save_result
 
 N_TOKENS = 3 * MAX_HORIZON + 1
 SAMPLERS: dict[str, Callable[[int], optuna.samplers.BaseSampler]] = {

@@ -16,9 +16,9 @@ import numpy as np
 import optuna
 from optuna.samplers import BaseSampler, NSGAIISampler
 
-from search.provenance import save_result
-from search.sampler import AuxLossSampler
-from search.space import suggest_aux_loss
+from search.evolution.sampler import AuxLossSampler
+from search.evolution.space import suggest_aux_loss
+from search.training.provenance import save_result
 
 SAMPLERS: dict[str, Callable[[], BaseSampler]] = {
     "AuxLossSampler": lambda: AuxLossSampler(seed=0),

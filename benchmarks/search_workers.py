@@ -19,9 +19,9 @@ import optuna
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 
-from search.provenance import save_result
-from search.sampler import AuxLossSampler, SearchComplete
-from search.space import params_to_loss, suggest_aux_loss
+from search.evolution.sampler import AuxLossSampler, SearchComplete
+from search.evolution.space import params_to_loss, suggest_aux_loss
+from search.training.provenance import save_result
 
 
 def open_storage(kind: str, folder: str) -> BaseStorage:

@@ -31,9 +31,9 @@ import optuna
 import psutil
 from optuna.trial import FrozenTrial, TrialState
 
-from search.provenance import save_result
-from search.space import params_to_loss
-from search.storage import open_storage
+from search.evolution.space import params_to_loss
+from search.execution.storage import open_storage
+from search.training.provenance import save_result
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from postgres import Postgres
@@ -59,7 +59,7 @@ population_size: 30
 max_horizon: 3
 retries: 100
 """
-AARL = [sys.executable, "-m", "search.cli"]
+AARL = [sys.executable, "-m", "search.cli.main"]
 
 
 class Program:

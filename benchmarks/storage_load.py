@@ -26,10 +26,10 @@ import psutil
 from optuna.samplers import BaseSampler, NSGAIISampler
 from optuna.trial import TrialState
 
-from search.provenance import save_result
-from search.sampler import PLACE_KEY, AuxLossSampler
-from search.space import suggest_aux_loss
-from search.storage import open_storage
+from search.evolution.sampler import PLACE_KEY, AuxLossSampler
+from search.evolution.space import suggest_aux_loss
+from search.execution.storage import open_storage
+from search.training.provenance import save_result
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from postgres import Postgres, free_port
@@ -88,11 +88,11 @@ def measure(name: str, n_trials: int, n_workers: int, max_horizon: int, server: 
     """The load with one sampler."""
     url, port = server.create(name.lower()), free_port()
     where = f"grpc://127.0.0.1:{port}"
-    serve = f"from search.storage import serve_proxy; serve_proxy({url!r}, port={port})"
+    serve = f"from search.execution.storage import serve_proxy; serve_proxy({url!r}, port={port})"
     proxy = subprocess.Popen([sys.executable, "-c", serve])
     # Imports once, and forks the workers before anybody has threads.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["search.sampler", "search.storage"])
+    context.set_forkserver_preload(["search.evolution.sampler", "search.execution.storage"])
     taken, start, results = context.Value("i", 0), context.Barrier(n_workers + 1), context.SimpleQueue()
     try:
         optuna.create_study(study_name=STUDY, storage=open_storage(where, patience=STARTING), direction="maximize")

@@ -22,7 +22,7 @@ from rich.table import Table
 from stable_baselines3.common.logger import configure
 from train_step import BATCH, fill, modes, ours, synchronize
 
-from search.provenance import save_result
+from search.training.provenance import save_result
 
 CANDIDATES = 700
 GRADIENT_STEPS = 500_000 // 4

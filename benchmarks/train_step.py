@@ -34,7 +34,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_aarl import SACAux
 from sb3_aarl.encoders import PixelEncoder
-from search.provenance import save_result
+from search.training.provenance import save_result
 
 ACTION_DIM = 6
 STATE_DIM = 17

@@ -18,8 +18,9 @@ import optuna
 import torch as th
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from search import benchmark, cli
-from search.grid import Cell
+from search.cli.main import main as cli
+from search.execution.matrix import Cell
+from search.studies import benchmark
 
 PROGRAM = f"python results/{Path(__file__).name}"
 PRODUCTS = {getattr(th.ops.aten, name).default for name in ("mm", "addmm", "bmm", "baddbmm")}
@@ -51,7 +52,7 @@ class EmulatedBenchmark(benchmark.Benchmark):
 
 
 def load_benchmark(*args: Any, **kwargs: Any) -> EmulatedBenchmark:
-    """``search.benchmark.load_benchmark``, of files with ``precision: bf16`` and ``policy: MlpPolicy`` only."""
+    """``search.studies.benchmark.load_benchmark``, of files with ``precision: bf16`` and ``policy: MlpPolicy`` only."""
     loaded = load(*args, **kwargs)
     for variant, settings in loaded.hyperparameters.items():
         for name, needed in (("precision", "bf16"), ("policy", "MlpPolicy")):

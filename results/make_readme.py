@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_aarl.callbacks import read_curve
-from search.benchmark import read_abouts, task_name
-from search.table import closest_table, paper_scores
+from search.results.table import closest_table, paper_scores
+from search.studies.benchmark import read_abouts, task_name
 
 RESULTS = Path(__file__).parent
 ABOUT = "about.md"
@@ -104,7 +104,7 @@ def printed_table(folder: Path) -> str:
 
     :param folder: Folder of a benchmark
     """
-    program = [sys.executable, "-m", "search.cli", "table", str(folder)]
+    program = [sys.executable, "-m", "search.cli.main", "table", str(folder)]
     environment = {**os.environ, "COLUMNS": "120", "NO_COLOR": "1"}
     printed = subprocess.run(
         program, env=environment, cwd=RESULTS.parent, text=True, stdout=subprocess.PIPE, check=True

@@ -11,8 +11,8 @@ from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.sampler import AuxLossSampler, SearchComplete
-from search.space import suggest_aux_loss
+from search.evolution.sampler import AuxLossSampler, SearchComplete
+from search.evolution.space import suggest_aux_loss
 
 SETTINGS: dict[str, Any] = {"population_size": 12, "n_random": 8, "n_prior": 4, "max_horizon": 2, "n_stages": 3}
 

@@ -22,9 +22,9 @@ from scipy.spatial.distance import pdist
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from sb3_aarl.catalog import published
-from search import analysis
-from search.sampler import AuxLossSampler
-from search.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+from search.evolution.sampler import AuxLossSampler
+from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+from search.results import analysis
 
 # Section 3.3, typed in again.
 PATTERNS = {

@@ -18,13 +18,14 @@ from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss
 from sb3_aarl.callbacks import read_curve
-from search import grid, provenance, table
-from search.benchmark import Benchmark, load_benchmark, parse_seeds, parse_steps, run_folder
-from search.cli import app
-from search.config import load_hyperparameters
-from search.grid import Cell
-from search.provenance import ABOUT
-from search.training import train_candidate
+from search.cli.main import app
+from search.execution import matrix as grid
+from search.execution.matrix import Cell
+from search.results import table
+from search.studies.benchmark import Benchmark, load_benchmark, parse_seeds, parse_steps, run_folder
+from search.training.config import load_hyperparameters
+from search.training.provenance import ABOUT
+from search.training.run import provenance, train_candidate
 
 ROOT = Path(__file__).parent.parent
 ZOO = ROOT / "zoo_configs"
@@ -199,7 +200,7 @@ def reference(cell: Cell) -> list[float]:
 def test_killed_and_gone_on_with_it_is_what_it_would_have_been(folder: Path) -> None:
     options = ["mine.yml", "plain.yml", "--checkpoints", "300", "--seeds", "0-1", "--episodes", "1", "--threads", "1"]
     command = ["benchmark", *options, "--out", "out"]
-    program = [sys.executable, "-c", "from search.cli import main; main()", *command]
+    program = [sys.executable, "-c", "from search.cli.main import main; main()", *command]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     finished: set[Path] = set()
     with subprocess.Popen(program, env=environment, stdout=subprocess.DEVNULL) as process:

@@ -22,15 +22,16 @@ from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
-from search import evolve, training
-from search.cli import ZOO, _stages_table, app, main
-from search.config import load_config
-from search.cross_validation import make_grid
-from search.grid import MAX_TRIES, Cell, Grid
-from search.provenance import read_about, write_about
-from search.sampler import StageProgress
-from search.space import distributions, loss_to_params
-from search.storage import open_storage
+from search.cli.main import ZOO, _stages_table, app, main
+from search.evolution.sampler import StageProgress
+from search.evolution.space import distributions, loss_to_params
+from search.execution import driver as evolve
+from search.execution.matrix import MAX_TRIES, Cell, Grid
+from search.execution.storage import open_storage
+from search.studies.cross_validation import make_grid
+from search.training import run as training
+from search.training.config import load_config
+from search.training.provenance import read_about, write_about
 
 ROOT = Path(__file__).parent.parent
 HYPER = {
@@ -60,7 +61,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_train_shows_the_curve_and_says_where_the_model_is(folder: Path) -> None:
     options = ("--config", "hyper.yml", "--evaluations", "2", "--episodes", "1", "--seed", "4", "--out", "here")
     # As without the extra "search".
-    program = "import sys; sys.modules |= dict.fromkeys(['optuna', 'pandas', 'sklearn']); from search.cli import main; main()"
+    program = "import sys; sys.modules |= dict.fromkeys(['optuna', 'pandas', 'sklearn']); "
+    program += "from search.cli.main import main; main()"
     command = [
         sys.executable,
         "-c",
@@ -203,7 +205,7 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(run: str, monkey
     def serve(storage: BaseStorage, artifacts: Path, host: str, port: int) -> None:
         served.append((optuna.get_all_study_names(storage), artifacts, host, port))
 
-    monkeypatch.setattr("search.dashboard.serve", serve)
+    monkeypatch.setattr("search.results.dashboard.serve", serve)
     result = runner.invoke(app, ["dashboard", run, "--port", "8123"])
     assert result.exit_code == 0, result.stderr
     assert served == [(["some"], Path("runs/some/artifacts"), "127.0.0.1", 8123)]
@@ -216,7 +218,7 @@ def test_dashboard_leaves_studies_alone_that_are_no_searches(folder: Path, monke
         study.set_user_attr("config", {"learning_rate": 1e-3})
         study.add_trial(optuna.create_trial(values=[1.0] * len(directions)))
     before = [(study.user_attrs, study.system_attrs) for study in storage.get_all_studies()]
-    monkeypatch.setattr("search.dashboard.serve", lambda *arguments: None)
+    monkeypatch.setattr("search.results.dashboard.serve", lambda *arguments: None)
     result = runner.invoke(app, ["dashboard", "runs/some"])
     assert result.exit_code == 0, result.stderr
     assert [(study.user_attrs, study.system_attrs) for study in storage.get_all_studies()] == before
@@ -312,7 +314,7 @@ def test_what_cannot_be_searched_is_refused_before_anything_is_made(
 def test_a_cross_validation_with_a_failed_run_ranks_the_others_and_says_so(
     cross_validation: Grid, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("search.cli.console", Console(width=200))  # a narrow one would break lines
+    monkeypatch.setattr("search.cli.main.console", Console(width=200))  # a narrow one would break lines
     worst, middle, best = map(str, LOSSES)
     failed = Cell(best, "dm_control/reacher-easy-v0", 1)
     add_runs(cross_validation, {worst: 1.0, middle: 2.0, best: 3.0}, lambda cell: cell == failed)

@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sb3_aarl import AuxLoss, SACAux, catalog
-from search.config import ConfigError, SearchConfig, load_config, load_hyperparameters, merge, resolve_env_id
-from search.training import make_env
+from search.training.config import ConfigError, SearchConfig, load_config, load_hyperparameters, merge, resolve_env_id
+from search.training.run import make_env
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 SEARCHES = sorted((ZOO / "search").glob("*.yml"))

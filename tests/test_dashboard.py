@@ -16,12 +16,13 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from sb3_aarl.aux_loss import AuxLoss
-from search import dashboard, workers
-from search.notation import subscripts
-from search.sampler import AuxLossSampler, SearchComplete
-from search.space import distributions, loss_to_params, suggest_aux_loss
-from search.storage import open_storage
-from search.trials import lineage, loss_of
+from search.evolution.sampler import AuxLossSampler, SearchComplete
+from search.evolution.space import distributions, loss_to_params, suggest_aux_loss
+from search.execution import workers
+from search.execution.storage import open_storage
+from search.results import dashboard
+from search.results.notation import subscripts
+from search.results.trials import lineage, loss_of
 
 EVIL = "<script>document.title='owned'</script> ![x](https://example.org/x.png) **bold** | `code`\n# www.example.org"
 BASELINES = [("SAC", 90.0), ("CURL", 110.0)]

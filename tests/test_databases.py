@@ -27,9 +27,9 @@ from optuna.trial import TrialState
 from postgres import PASSWORD, Postgres, free_port
 from sqlalchemy.exc import DBAPIError, OperationalError
 
-from search import workers
-from search.objective import disk_problem
-from search.storage import Database, ServerLost, SharedReads, open_storage, serve_proxy
+from search.execution import workers
+from search.execution.storage import Database, ServerLost, SharedReads, open_storage, serve_proxy
+from search.studies.objective import disk_problem
 
 pytestmark = pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed")
 names = (f"database{number}" for number in count())
@@ -64,7 +64,7 @@ def python(code: str, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
 
 
 def proxy(url: str, port: int) -> Any:
-    return python(f"from search.storage import serve_proxy; serve_proxy({url!r}, port={port})")
+    return python(f"from search.execution.storage import serve_proxy; serve_proxy({url!r}, port={port})")
 
 
 # Outages.
@@ -122,7 +122,7 @@ def check_work_through(where: str, url: str, outages: list[Callable[[], None]], 
 def test_work_goes_on_through_restarts_of_postgresql(postgres: Postgres, url: str, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     check_work_through(url, url, [lambda: postgres.restart(seconds=0.5), lambda: postgres.restart(crash=True)])
-    lines = [record.getMessage() for record in caplog.records if record.name == "search.storage"]
+    lines = [record.getMessage() for record in caplog.records if record.name == "search.execution.storage"]
     # One line when it begins and one when it is over, not one for each thread and call.
     assert [" is back after " in line for line in lines] in ([False, True], [False, True] * 2), lines
     assert PASSWORD not in caplog.text
@@ -346,8 +346,8 @@ def test_studies_are_made_and_deleted_once(study: optuna.Study, lose: Callable[.
 
 WORKER = """
 import sys, time, optuna
-from search import workers
-from search.storage import open_storage
+from search.execution import workers
+from search.execution.storage import open_storage
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 study = optuna.load_study(study_name="study", storage=open_storage(sys.argv[1], heartbeat_interval=1))
 def objective(trial):
@@ -439,7 +439,7 @@ def test_a_worker_is_judged_by_its_own_interval(tmp_path: Path) -> None:
 def test_nobody_is_blamed_for_a_time_in_which_nobody_looked(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("search.storage.LATE_SECONDS", 2.0)
+    monkeypatch.setattr("search.execution.storage.LATE_SECONDS", 2.0)
     where = str(tmp_path) if kind == "journal" else f"sqlite:///{tmp_path}/study.db"
     study = optuna.create_study(storage=open_storage(where, heartbeat_interval=1))
     workers.beat(study._storage, study.ask()._trial_id)
@@ -556,7 +556,7 @@ def test_a_proxy_stops_on_ctrl_c_also_while_its_database_is_away(postgres: Postg
 
 IMPATIENT = """
 import sys
-from search import storage
+from search.execution import storage
 storage.Database.patience = 0.5
 storage.serve_proxy(sys.argv[1], port=int(sys.argv[2]))
 """

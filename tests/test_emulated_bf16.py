@@ -14,9 +14,9 @@ import torch as th
 from test_sac_aux import filled_model
 from torch.utils._python_dispatch import TorchDispatchMode, _get_current_dispatch_mode
 
-import search.benchmark
+import search.studies.benchmark
 from sb3_aarl.callbacks import Evaluation
-from search.provenance import read_about
+from search.training.provenance import read_about
 
 ROOT = Path(__file__).parent.parent
 emulated: dict[str, Any] = runpy.run_path(str(ROOT / "results" / "emulated_bf16.py"))
@@ -80,7 +80,7 @@ def test_runs_are_trained_with_it_and_say_so(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(ValueError, match=r"pixels\.yml does not say policy: MlpPolicy"):
         emulated["load_benchmark"]([pixels], ["cheetah-run"], [0], [1000])
     grid = emulated["load_benchmark"]([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [5], [1000])
-    plain = search.benchmark.load_benchmark([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [5], [1000])
+    plain = search.studies.benchmark.load_benchmark([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [5], [1000])
     (cell,) = grid.cells
     assert grid.about(cell) == {**plain.about(cell), "program": "python results/emulated_bf16.py"}
 
@@ -90,7 +90,7 @@ def test_runs_are_trained_with_it_and_say_so(tmp_path: Path, monkeypatch: pytest
         modes.append(_get_current_dispatch_mode())
         return SimpleNamespace(curve=[Evaluation(1000, 1.0, 0.0, 10, 2.0)], aux_loss=None, aulc=1.0)
 
-    monkeypatch.setattr(search.benchmark, "train_candidate", train)
+    monkeypatch.setattr(search.studies.benchmark, "train_candidate", train)
     study = optuna.create_study()
     assert grid.train(study.ask(), cell, tmp_path) == 1.0
     assert [type(mode) for mode in modes] == [EmulatedBfloat16] and _get_current_dispatch_mode() is None
@@ -102,9 +102,9 @@ def test_runs_are_trained_with_it_and_say_so(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(ValueError, match=r"begun with program='python results/emulated_bf16\.py'"):
         plain.prepare(tmp_path)
     other = tmp_path / "other"
-    plain = search.benchmark.load_benchmark([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [6], [1000])
+    plain = search.studies.benchmark.load_benchmark([choices / "sac_identity_small_bf16.yml"], ["cheetah-run"], [6], [1000])
     plain.prepare(other)
     (run,) = (path.parent for path in other.rglob("provenance.json"))
     shutil.copytree(run, tmp_path / run.relative_to(other))
     with pytest.raises(ValueError, match="cannot be compared: program="):
-        search.benchmark.read_abouts(tmp_path)
+        search.studies.benchmark.read_abouts(tmp_path)

@@ -26,12 +26,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_aarl import AuxLoss, SACAux, sac_aux
 from sb3_aarl.envs import make_dmc_env
 from sb3_aarl.sac_aux import ExplodedError, NonFiniteError
-from search.config import load_config
-from search.objective import CandidateFailed, DiskError, Objective, check_study, disk_problem, memory_problem
-from search.sampler import AuxLossSampler
-from search.space import loss_to_params
-from search.storage import open_storage
-from search.training import TrainingError
+from search.evolution.sampler import AuxLossSampler
+from search.evolution.space import loss_to_params
+from search.execution.storage import open_storage
+from search.studies.objective import CandidateFailed, DiskError, Objective, check_study, disk_problem, memory_problem
+from search.training.config import load_config
+from search.training.run import TrainingError
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 NETS: dict[str, Any] = {
@@ -446,7 +446,7 @@ def foreign(suggest: Callable[[optuna.Trial], float], direction: str = "maximize
 
 
 def of_space(trial: optuna.Trial, max_horizon: int, operators: list[str] | None = None) -> float:
-    from search.space import suggest_aux_loss
+    from search.evolution.space import suggest_aux_loss
 
     suggest_aux_loss(trial, max_horizon, operators)
     return 0.0

@@ -16,10 +16,10 @@ from optuna.trial import TrialState, create_trial
 from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import Evaluation, write_curve
-from search.benchmark import read_curves
-from search.cli import app
-from search.space import distributions, loss_to_params, random_loss
-from search.storage import open_storage
+from search.cli.main import app
+from search.evolution.space import distributions, loss_to_params, random_loss
+from search.execution.storage import open_storage
+from search.studies.benchmark import read_curves
 
 runner = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"})
 FIGURES = ("evolution", "histogram", "rankings", "patterns")
@@ -206,7 +206,7 @@ def test_a_benchmark_is_no_search_but_part_of_a_report(study: optuna.Study, benc
 
 def test_the_help_needs_nothing_heavy() -> None:
     program = (
-        "import sys; from typer.testing import CliRunner; from search.cli import app; "
+        "import sys; from typer.testing import CliRunner; from search.cli.main import app; "
         "[CliRunner().invoke(app, [*of, '--help']) for of in ([], ['figures'], ['analyze'])]; "
         "print([name for name in ('torch', 'optuna', 'pandas', 'matplotlib', 'plotly') if name in sys.modules])"
     )

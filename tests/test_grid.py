@@ -15,10 +15,15 @@ from optuna.trial import TrialState
 from optuna_dashboard._note import get_note_from_system_attrs
 
 from sb3_aarl import catalog
-from search import cross_validation, evolve, grid, objective, operator_selection, pool, training, workers
-from search.config import CrossValidation, SearchConfig
-from search.pool import WorkerError
-from search.storage import load_study, open_storage
+from search.execution import driver as evolve
+from search.execution import local as pool
+from search.execution import matrix as grid
+from search.execution import workers
+from search.execution.local import WorkerError
+from search.execution.storage import load_study, open_storage
+from search.studies import cross_validation, objective, operator_selection
+from search.training import run as training
+from search.training.config import CrossValidation, SearchConfig
 
 HYPERPARAMETERS = Path(__file__).parent.parent / "zoo_configs" / "demo.yml"
 CONFIG = SearchConfig(Path("some.yml"), "dm_control/cartpole-balance-v0", HYPERPARAMETERS, (400, 800))

@@ -13,11 +13,12 @@ from optuna_dashboard._note import get_note_from_system_attrs
 from program import aarl, start
 from typer.testing import CliRunner
 
-from search import evolve, workers
-from search.cli import app
-from search.config import Baseline, SearchConfig, load_config
-from search.sampler import AuxLossSampler
-from search.space import params_to_loss, suggest_aux_loss
+from search.cli.main import app
+from search.evolution.sampler import AuxLossSampler
+from search.evolution.space import params_to_loss, suggest_aux_loss
+from search.execution import driver as evolve
+from search.execution import workers
+from search.training.config import Baseline, SearchConfig, load_config
 
 CONFIGS = sorted((Path(__file__).parent.parent / "zoo_configs" / "search").glob("*.yml"))
 TINY = """\

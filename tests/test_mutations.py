@@ -11,8 +11,8 @@ from scipy.stats import binom, binomtest, chi2_contingency, chisquare
 from test_space import losses
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.mutations import RejectedLoss, crossover, horizon_change, replacement
-from search.space import random_loss
+from search.evolution.mutations import RejectedLoss, crossover, horizon_change, replacement
+from search.evolution.space import random_loss
 
 PARENT = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 seeds = st.integers(0, 2**32)

@@ -28,14 +28,16 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_aarl import AuxLoss, SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve
 from sb3_aarl.envs import make_dmc_env
-from search import evolve, training, workers
-from search.config import ConfigError, load_config
-from search.objective import CandidateFailed, DiskError, Objective, disk_problem, make_pruner, mean_curve
-from search.pool import Unfit, WorkerError
-from search.sampler import AuxLossSampler
-from search.space import loss_to_params
-from search.storage import open_storage
-from search.training import TrainingError, spread_checkpoints, train_candidate
+from search.evolution.sampler import AuxLossSampler
+from search.evolution.space import loss_to_params
+from search.execution import driver as evolve
+from search.execution import workers
+from search.execution.local import Unfit, WorkerError
+from search.execution.storage import open_storage
+from search.studies.objective import CandidateFailed, DiskError, Objective, disk_problem, make_pruner, mean_curve
+from search.training import run as training
+from search.training.config import ConfigError, load_config
+from search.training.run import TrainingError, spread_checkpoints, train_candidate
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 ENV = "dm_control/cartpole-balance-v0"
@@ -318,7 +320,7 @@ def test_a_candidate_whose_environment_died_is_given_out_again(tmp_path: Path, m
             raise training.EnvironmentLost("the process of an environment was killed")
         return training.TrainingRun([Evaluation(800, 1.0, 0.0, 1, 0.0)], 1.0)
 
-    monkeypatch.setattr("search.objective.train_candidate", train)
+    monkeypatch.setattr("search.studies.objective.train_candidate", train)
     objective = make_objective(tmp_path)
     study = optuna.create_study(
         direction="maximize", sampler=AuxLossSampler(n_random=1, n_prior=0, n_stages=1, max_horizon=2, seed=0)
@@ -341,13 +343,13 @@ def test_a_worker_whose_gpu_failed_ends_and_another_one_goes_on(tmp_path: Path, 
         raise training.DeviceError("the GPU failed: CUDA error: unspecified launch failure")
 
     with monkeypatch.context() as patch:
-        patch.setattr("search.objective.train_candidate", fail)
+        patch.setattr("search.studies.objective.train_candidate", fail)
         with pytest.raises(Unfit, match=r"^the GPU failed: CUDA error: unspecified launch failure$"):
             evolve.run_worker("search", tmp_path, where, 60)
     (failed,) = study.trials
     assert failed.state == TrialState.FAIL and failed.user_attrs["reason"].startswith("the GPU failed: CUDA error")
     run = training.TrainingRun([Evaluation(800, 1.0, 0.0, 1, 0.0)], 1.0)
-    monkeypatch.setattr("search.objective.train_candidate", lambda *arguments, **keywords: run)
+    monkeypatch.setattr("search.studies.objective.train_candidate", lambda *arguments, **keywords: run)
     evolve.run_worker("search", tmp_path, where, 60)
     assert [trial.state for trial in study.trials] == [TrialState.FAIL, TrialState.COMPLETE, TrialState.COMPLETE]
     assert study.trials[1].user_attrs["loss"] == failed.user_attrs["loss"]
@@ -367,7 +369,7 @@ def test_a_study_that_somebody_deletes_is_named(kind: str, tmp_path: Path, monke
         on_evaluation(evaluation)
         return training.TrainingRun([evaluation], 1.0)
 
-    monkeypatch.setattr("search.objective.train_candidate", delete)
+    monkeypatch.setattr("search.studies.objective.train_candidate", delete)
     message = r"^study 'search' was deleted from its storage$"
     with pytest.raises(ValueError, match=message):
         evolve.run_worker("search", tmp_path, where, 60)
@@ -399,7 +401,7 @@ def test_a_worker_that_was_taken_for_dead_trains_no_further_seeds(tmp_path: Path
         on_evaluation(evaluation)
         return training.TrainingRun([evaluation], 1.0)
 
-    monkeypatch.setattr("search.objective.train_candidate", train)
+    monkeypatch.setattr("search.studies.objective.train_candidate", train)
     study.enqueue_trial(loss_to_params(LOSS))
     with pytest.raises(Exception) as raised:
         study.optimize(objective, n_trials=1)
@@ -428,7 +430,7 @@ def test_several_environments_go_on_after_an_interruption(tmp_path: Path, monkey
 
 SCRIPT = """
 import json, os, signal, sys
-from search.training import train_candidate
+from search.training.run import train_candidate
 arguments = json.loads(sys.argv[1])
 
 def on_evaluation(evaluation):
@@ -784,8 +786,8 @@ def test_ctrl_c_at_any_moment_is_not_the_candidates_fault(
     study = optuna.create_study(direction="maximize", sampler=sampler)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("search.objective.train_candidate", lambda *_, **__: training.TrainingRun([], 0.0))
-        patch.setattr(f"search.objective.{moment}", interrupt)
+        patch.setattr("search.studies.objective.train_candidate", lambda *_, **__: training.TrainingRun([], 0.0))
+        patch.setattr(f"search.studies.objective.{moment}", interrupt)
         study.optimize(objective, n_trials=1, catch=CandidateFailed)
     study.ask()
     first, again = (trial.system_attrs["AuxLossSampler:place"] for trial in study.trials)
@@ -816,7 +818,7 @@ def test_trials_of_one_loss_have_folders_of_their_own(tmp_path: Path) -> None:
 def test_a_heartbeats_copy_of_a_killed_trial_goes_on_in_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study, objective = make_study(), make_objective(tmp_path)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("search.objective.mean_curve", interrupt)
+        patch.setattr("search.studies.objective.mean_curve", interrupt)
         study.optimize(objective, n_trials=1)
     with pytest.warns(optuna.exceptions.ExperimentalWarning):
         RetryHeartbeatStaleTrialCallback()(study, study.trials[0])

@@ -16,8 +16,9 @@ from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
 
 from sb3_aarl.aux_loss import AuxLoss
-from search import analysis
-from search.plots import (
+from search.evolution.space import distributions, loss_to_params, random_loss
+from search.results import analysis
+from search.results.plots import (
     evolution_figure,
     evolution_plot,
     histogram_plot,
@@ -27,8 +28,7 @@ from search.plots import (
     patterns_plot,
     rankings_plot,
 )
-from search.space import distributions, loss_to_params, random_loss
-from search.trials import curve_of, lineage, loss_of, ranked
+from search.results.trials import curve_of, lineage, loss_of, ranked
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 BASELINES = [("SAC", 12.5), ("<b>CURL</b>", -3.0)]

@@ -15,8 +15,8 @@ import pytest
 import torch as th
 from optuna.exceptions import StorageInternalError
 
-from search import pool as pool_module
-from search.pool import Unfit, WorkerError, WorkerPool
+from search.execution import local as pool_module
+from search.execution.local import Unfit, WorkerError, WorkerPool
 
 
 def put_away(folder: Path) -> None:
@@ -198,7 +198,7 @@ def test_what_a_user_can_mend_is_one_line(target: Callable[[Path], None], expect
 PROGRAM = """
 import sys, time
 from pathlib import Path
-from search.pool import WorkerPool
+from search.execution.local import WorkerPool
 from test_pool import write_gpu
 
 if __name__ == "__main__":

@@ -16,13 +16,14 @@ import pytest
 import torch as th
 from optuna.trial import TrialState
 
-from search import pool as pool_module
-from search import ray_launcher, workers
-from search.pool import Unfit, WorkerError
-from search.ray_launcher import RayPool, RayWorker, check_storage
-from search.sampler import AuxLossSampler, SearchComplete
-from search.space import suggest_aux_loss
-from search.storage import open_storage
+from search.evolution.sampler import AuxLossSampler, SearchComplete
+from search.evolution.space import suggest_aux_loss
+from search.execution import local as pool_module
+from search.execution import ray as ray_launcher
+from search.execution import workers
+from search.execution.local import Unfit, WorkerError
+from search.execution.ray import RayPool, RayWorker, check_storage
+from search.execution.storage import open_storage
 
 ray = pytest.importorskip("ray")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
@@ -197,7 +198,7 @@ def test_workers_that_keep_dying_stop_the_pool(cluster: Any, monkeypatch: pytest
 
 def test_a_worker_that_fits_no_node_is_told_once_and_waits(cluster: Any, caplog: pytest.LogCaptureFixture) -> None:
     with (
-        caplog.at_level(logging.WARNING, "search.ray_launcher"),
+        caplog.at_level(logging.WARNING, "search.execution.ray"),
         RayPool(refuse, (), cpus_per_trial=1, gpus_per_trial=4, address=cluster.address) as pool,
     ):
         for _ in range(3):

@@ -20,11 +20,11 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search import analysis
-from search.notation import mathml, subscripts
-from search.report import stage_rows, stored_baselines, stored_runs, time_spent, write_report
-from search.sampler import AuxLossSampler, SearchComplete
-from search.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+from search.evolution.sampler import AuxLossSampler, SearchComplete
+from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+from search.results import analysis
+from search.results.notation import mathml, subscripts
+from search.results.report import stage_rows, stored_baselines, stored_runs, time_spent, write_report
 
 START = datetime(2026, 1, 1)
 EVIL = "<script>document.title='owned'</script><img src=https://example.org/x.png>"

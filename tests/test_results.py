@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-import search.benchmark
-import search.cli
+import search.cli.main
+import search.studies.benchmark
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
-from search.benchmark import Benchmark, load_benchmark, read_abouts, run_folder
-from search.provenance import ABOUT
-from search.table import paper_scores, read_tables
+from search.results.table import paper_scores, read_tables
+from search.studies.benchmark import Benchmark, load_benchmark, read_abouts, run_folder
+from search.training.provenance import ABOUT
 
 RESULTS = Path(__file__).parent.parent / "results"
 make_readme: dict[str, Any] = runpy.run_path(str(RESULTS / "make_readme.py"))
@@ -29,17 +29,17 @@ SESSION = {"commit": "c0ffee", "cpu": "a processor", "gpu": "none", "date": "202
 def asked_for(folder: Path, command: str, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """What a printed command would train."""
     trained: list[Benchmark] = []
-    monkeypatch.setattr(search.cli, "_train_grid", lambda grid, *_: (trained.append(grid), {}))
+    monkeypatch.setattr(search.cli.main, "_train_grid", lambda grid, *_: (trained.append(grid), {}))
     with monkeypatch.context() as patch:
         patch.chdir(RESULTS.parent)
         program, *words = shlex.split(command)
         if program == "python":
             emulated = runpy.run_path(words[0])
-            patch.setattr(search.benchmark, "load_benchmark", emulated["load_benchmark"])
+            patch.setattr(search.studies.benchmark, "load_benchmark", emulated["load_benchmark"])
             words[0] = "benchmark"
         else:
             assert program == "aarl"
-        CliRunner().invoke(search.cli.app, [*words, "--out", str(folder / "again")])
+        CliRunner().invoke(search.cli.main.app, [*words, "--out", str(folder / "again")])
     (grid,) = trained
     return [grid.about(cell) for cell in grid.cells]
 

@@ -23,9 +23,10 @@ import torch as th
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve
-from search import checkpoint, training
-from search.checkpoint import CheckpointError, opened, seal, user_key
-from search.training import train_candidate
+from search.training import checkpoint
+from search.training import run as training
+from search.training.checkpoint import CheckpointError, opened, seal, user_key
+from search.training.run import train_candidate
 
 LOSS = "{s_t, a_t} -> {s_t+1}"
 STEPS = 150
@@ -60,7 +61,7 @@ def key(tmp_path_factory: pytest.TempPathFactory) -> Iterator[bytes]:
 def processes() -> multiprocessing.context.ForkServerContext:
     """Processes that begin with everything imported."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["search.training", "torch._dynamo"])  # which the first optimizer imports
+    context.set_forkserver_preload(["search.training.run", "torch._dynamo"])  # which the first optimizer imports
     return context
 
 

@@ -22,16 +22,16 @@ from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_s
 from optuna.trial import FrozenTrial, TrialState
 from search_worker import SETTINGS, DivergedError, diverges, open_storage, score, work
 
-import search.storage
+import search.execution.storage
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search import sampler as module
-from search import workers
-from search.sampler import PLACE_KEY, AuxLossSampler, SearchComplete, StageProgress
-from search.space import loss_to_params, params_to_loss, suggest_aux_loss
+from search.evolution import sampler as module
+from search.evolution.sampler import PLACE_KEY, AuxLossSampler, SearchComplete, StageProgress
+from search.evolution.space import loss_to_params, params_to_loss, suggest_aux_loss
+from search.execution import workers
 
 # Started from one process that has imported what workers need.
 processes = get_context("forkserver")
-processes.set_forkserver_preload(["search.sampler"])
+processes.set_forkserver_preload(["search.evolution.sampler"])
 
 
 @pytest.fixture(autouse=True)
@@ -633,7 +633,7 @@ def test_a_worker_shows_that_it_lives_before_it_shows_its_name(tmp_path: Path, m
     done = []
     monkeypatch.setattr(workers, "beat", lambda *arguments: done.append("sign"))
     monkeypatch.setattr(module, "_show", lambda study, trial, key, value: done.append(key))
-    study = make_study(storage=search.storage.open_storage(tmp_path))
+    study = make_study(storage=search.execution.storage.open_storage(tmp_path))
     study.optimize(lambda trial: score(suggest_aux_loss(trial, 2)), n_trials=1)
     assert done[:2] == ["sign", workers.WORKER_KEY]
 

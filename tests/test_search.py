@@ -17,9 +17,9 @@ from program import aarl, start
 from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss
-from search.cli import app
-from search.space import params_to_loss
-from search.storage import open_storage
+from search.cli.main import app
+from search.evolution.space import params_to_loss
+from search.execution.storage import open_storage
 
 HYPERPARAMETERS = """
 default:

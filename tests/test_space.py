@@ -15,8 +15,8 @@ from optuna.trial import FixedTrial, TrialState
 from scipy.stats import binomtest, chisquare
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.sampler import PLACE_KEY, AuxLossSampler
-from search.space import (
+from search.evolution.sampler import PLACE_KEY, AuxLossSampler
+from search.evolution.space import (
     check_operators,
     distributions,
     forward_dynamics_prior,

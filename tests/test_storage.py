@@ -11,11 +11,11 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from typer.testing import CliRunner
 
-from search import provenance
-from search import storage as storage_module
-from search.cli import app
-from search.passwords import storage_name, without_password
-from search.storage import JOURNAL, open_storage
+from search.cli.main import app
+from search.execution import storage as storage_module
+from search.execution.passwords import storage_name, without_password
+from search.execution.storage import JOURNAL, open_storage
+from search.training import provenance
 
 
 @pytest.mark.parametrize("kept", [1, 40, -1], ids=str)
@@ -168,7 +168,7 @@ def test_a_password_in_a_url_with_an_error_is_not_shown(where: str, tmp_path: Pa
         assert "s3cret" not in result.output
 
 
-@pytest.mark.parametrize("program", ["/bin/aarl", "/work/search/cli.py"])
+@pytest.mark.parametrize("program", ["/bin/aarl", "/work/search/cli/main.py"])
 def test_the_command_in_notes_and_reports_has_no_password(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
     arguments = ["search", "a.yml", "--storage", "postgresql://me:se cret@host/db"]
     monkeypatch.setattr("sys.argv", [program, *arguments])

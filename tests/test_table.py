@@ -18,11 +18,11 @@ from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import Evaluation, write_curve
 from sb3_aarl.envs import env_ids
-from search import table
-from search.benchmark import run_folder
-from search.cli import app
-from search.grid import Cell
-from search.provenance import ABOUT
+from search.cli.main import app
+from search.execution.matrix import Cell
+from search.results import table
+from search.studies.benchmark import run_folder
+from search.training.provenance import ABOUT
 
 # The paper's tables as its text has them; table 3 and the first part of table 4 have the asterisks and daggers left out.
 PAPER = {

@@ -7,8 +7,8 @@ import pytest
 from sklearn.linear_model import BayesianRidge
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.space import random_loss
-from search.token_model import TokenModel, features
+from search.evolution.space import random_loss
+from search.evolution.surrogate import TokenModel, features
 
 
 def trials(n: int, max_horizon: int = 10, seed: int = 0) -> tuple[list[AuxLoss], np.ndarray]:

@@ -12,8 +12,8 @@ import psutil
 import pytest
 from optuna.trial import TrialState, create_trial
 
-from search import workers
-from search.storage import HEARTBEAT_KEY, open_storage
+from search.execution import workers
+from search.execution.storage import HEARTBEAT_KEY, open_storage
 
 
 def sleeper() -> subprocess.Popen[bytes]:

@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_aarl import SACAux, catalog, encoders
 from sb3_aarl.envs import env_ids, make_dmc_env
-from search.config import load_hyperparameters, merge
+from search.training.config import load_hyperparameters, merge
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 

@@ -18,7 +18,7 @@ from rich.progress import MofNCompleteColumn
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
-from search.passwords import storage_name, without_password
+from search.execution.passwords import storage_name, without_password
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from optuna import Study
 
     from sb3_aarl import AuxLoss
-    from search.evolve import Launch, Progress
-    from search.grid import Cell, Runs
+    from search.execution.driver import Launch, Progress
+    from search.execution.matrix import Cell, Runs
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 console = Console()
@@ -36,7 +36,7 @@ errors = Console(stderr=True, soft_wrap=True)
 YAML = (".yml", ".yaml")
 # What training alone does without, and commands import when they are called.
 OF_SEARCH = ("grpc", "joblib", "optuna", "optuna_dashboard", "plotly", "psutil", "sklearn", "threadpoolctl")
-ZOO = Path(__file__).parent.parent / "zoo_configs"
+ZOO = Path(__file__).parents[2] / "zoo_configs"
 
 
 @app.callback()
@@ -65,17 +65,17 @@ def clear_errors() -> Iterator[None]:
 
 def _one_line(error: Exception) -> str | None:
     """What a user is told of an error that he can mend, without passwords; None for others."""
-    from search.training import TrainingError
+    from search.training.run import TrainingError
 
     line = without_password(" ".join(str(error).split()))
     if isinstance(error, (ValueError, OSError, TrainingError)):
         return line
     if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in OF_SEARCH:
         return f"{line}: pip install 'sb3-aarl[search]'"
-    if "search.pool" in sys.modules:  # else it is not of Optuna, which a training alone does without
+    if "search.execution.local" in sys.modules:  # else it is not of Optuna, which a training alone does without
         from optuna.exceptions import StorageInternalError
 
-        from search.pool import WorkerError, message
+        from search.execution.local import WorkerError, message
 
         if isinstance(error, WorkerError):
             return line
@@ -107,7 +107,7 @@ def train(
 ) -> None:
     """Train with one auxiliary loss. Killed, the same command goes on from its last evaluation."""
     with clear_errors():
-        from search.training import train_and_keep
+        from search.training.run import train_and_keep
 
         run, folder, was_finished = train_and_keep(env, aux_loss, config, steps, evaluations, episodes, seed, out)
         table = Table("environment steps", "mean return", "deviation", "seconds", title=f"AULC {run.aulc:.1f}")
@@ -203,9 +203,9 @@ def search(
     with clear_errors():
         from functools import partial
 
-        from search import evolve
-        from search.config import load_config
-        from search.pool import WorkerPool
+        from search.execution import driver as evolve
+        from search.execution.local import WorkerPool
+        from search.training.config import load_config
 
         changes: dict[str, Any] = {"stages": stages, "pruner": pruner}
         settings = replace(load_config(config), **{key: value for key, value in changes.items() if value is not None})
@@ -216,7 +216,7 @@ def search(
         if launcher != "ray" and (given := [name for name, value in of_ray.items() if value is not None]):
             raise ValueError(f"--{given[0]} is for workers on a Ray cluster: say --launcher ray too")
         if launcher == "ray" and workers != 0:
-            from search.ray_launcher import RayPool
+            from search.execution.ray import RayPool
 
             if threads is not None:
                 raise ValueError("--threads is for workers of this machine: with Ray, say --cpus-per-trial")
@@ -260,8 +260,8 @@ def worker(
     with clear_errors():
         from functools import partial
 
-        from search import evolve
-        from search.pool import WorkerPool
+        from search.execution import driver as evolve
+        from search.execution.local import WorkerPool
 
         console.print(f"Working for {storage_name(storage)}", soft_wrap=True, markup=False)
         launch = partial(WorkerPool, n_workers=workers, threads=threads)
@@ -278,7 +278,7 @@ def proxy(
 ) -> None:
     """Serve a database to many workers through Optuna's gRPC proxy; they take --storage grpc://host:port."""
     with clear_errors():
-        from search.storage import serve_proxy
+        from search.execution.storage import serve_proxy
 
         console.print(f"grpc://{host}:{port}  (Ctrl-C to stop)", highlight=False)
         serve_proxy(storage, host, port)
@@ -327,8 +327,8 @@ def _train_grid(
     grid: "Runs", folder: Path, storage: str | None, workers: int, threads: int | None
 ) -> "tuple[pd.DataFrame, dict[Cell, str]]":
     """Train the runs of a grid that are missing, with a progress bar; scores of all, and what had to be given up."""
-    from search import grid as grids
-    from search.storage import load_study, open_storage
+    from search.execution import matrix as grids
+    from search.execution.storage import load_study, open_storage
 
     where = storage or str(folder)
     n_runs = len(grid.cells)
@@ -342,8 +342,8 @@ def _train_grid(
 
 def _compare(runs: "pd.DataFrame", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str) -> "pd.DataFrame | None":
     """Show a table of what can be compared and return it, None if that is nothing; and show what there is beside it."""
-    from search import cross_validation
-    from search import grid as grids
+    from search.execution import matrix as grids
+    from search.studies import cross_validation
 
     compared = grids.comparable(runs)
     others = runs.drop(compared.index)
@@ -384,10 +384,11 @@ def baselines(
     with clear_errors():
         from optuna import get_all_study_names
 
-        from search import cross_validation, evolve
-        from search.config import load_config
-        from search.dashboard import update_plots
-        from search.storage import load_study, open_storage
+        from search.execution import driver as evolve
+        from search.execution.storage import load_study, open_storage
+        from search.results.dashboard import update_plots
+        from search.studies import cross_validation
+        from search.training.config import load_config
 
         settings = load_config(config)
         if not settings.baselines:
@@ -406,8 +407,8 @@ def select_operator(
 ) -> None:
     """Compare the ten operators on forward dynamics, as in the paper's table 2."""
     with clear_errors():
-        from search import operator_selection
-        from search.config import load_config
+        from search.studies import operator_selection
+        from search.training.config import load_config
 
         settings = load_config(config)
         grid = operator_selection.make_grid(settings)
@@ -428,9 +429,9 @@ def cross_validate(
 ) -> None:
     """Train the best candidates of a search on several environments, and write the winner as YAML."""
     with clear_errors():
-        from search import cross_validation
-        from search.config import load_config
-        from search.storage import load_study, open_storage
+        from search.execution.storage import load_study, open_storage
+        from search.studies import cross_validation
+        from search.training.config import load_config
 
         settings = load_config(config)
         path = run_folder(config, folder)
@@ -472,7 +473,7 @@ def benchmark(
 ) -> None:
     """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command goes on with it."""
     with clear_errors():
-        from search.benchmark import load_benchmark, note_failures, parse_seeds, parse_steps
+        from search.studies.benchmark import load_benchmark, note_failures, parse_seeds, parse_steps
 
         names = [name.strip() for name in envs.split(",")] if envs else []
         steps = parse_steps(checkpoints) if checkpoints else ()
@@ -506,7 +507,7 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
     """The tables of a benchmark, and the same as files."""
     from json import dumps
 
-    from search import table as tables
+    from search.results import table as tables
 
     number, runs, comparison, iqm, better = tables.read_tables(folder, number)
     if csv is not None:
@@ -523,7 +524,7 @@ def _show_benchmark(folder: Path, number: int | None, csv: Path | None = None, j
 
 def _show_missing(runs: "pd.DataFrame") -> None:
     """What a benchmark was asked for and does not have, and what in it should not be compared."""
-    from search import table as tables
+    from search.results import table as tables
 
     for line in tables.missing(runs) + tables.mixed(runs):
         console.print(line, style="red", markup=False, soft_wrap=True, highlight=False)
@@ -551,10 +552,10 @@ def dashboard(
 ) -> None:
     """Watch a search in optuna-dashboard."""
     with clear_errors():
-        from search.dashboard import ARTIFACTS, serve, update_plots
-        from search.evolve import is_search
-        from search.report import stored_baselines
-        from search.storage import load_study, open_storage
+        from search.execution.driver import is_search
+        from search.execution.storage import load_study, open_storage
+        from search.results.dashboard import ARTIFACTS, serve, update_plots
+        from search.results.report import stored_baselines
 
         folder = _search_folder(folder, storage)
         opened = open_storage(storage or str(folder), create=False)
@@ -579,11 +580,11 @@ def report(
 ) -> None:
     """Write a report of a search as one HTML file."""
     with clear_errors():
-        from search import evolve
-        from search.config import load_config
-        from search.provenance import provenance
-        from search.report import stored_baselines, stored_runs, write_report
-        from search.storage import load_study, open_storage
+        from search.execution import driver as evolve
+        from search.execution.storage import load_study, open_storage
+        from search.results.report import stored_baselines, stored_runs, write_report
+        from search.training.config import load_config
+        from search.training.provenance import provenance
 
         if config is None and folder is not None and folder.suffix in YAML:
             config = folder
@@ -646,7 +647,7 @@ def analyze(
     with clear_errors():
         from json import dumps
 
-        from search import analysis
+        from search.results import analysis
 
         summaries = {
             name: analysis.summary(of.get_trials(deepcopy=False), of.direction, _patterns(pattern), ties_without, top)
@@ -713,8 +714,8 @@ Out = Annotated[
 def evolution(folders: Searches = None, storage: Storage = None, study: Studies = None, out: Out = None) -> None:
     """Scores of all candidates by stage, with baselines where they are trained (figures 4 and 6)."""
     with clear_errors():
-        from search import analysis, plots
-        from search.report import stored_baselines
+        from search.results import analysis, plots
+        from search.results.report import stored_baselines
 
         studies = _open_studies(folders, storage, study)
         lines = {name: stored_baselines(of._storage, of.study_name) for name, (of, _) in studies.items()}
@@ -735,7 +736,7 @@ def histogram(
 ) -> None:
     """Distribution of the scores of up to three searches, such as with and without pruning of the space (figure 7)."""
     with clear_errors():
-        from search import analysis, plots
+        from search.results import analysis, plots
 
         studies = _open_studies(folders, storage, study)
         tables = {name: analysis.trial_table(of.get_trials(deepcopy=False)) for name, (of, _) in studies.items()}
@@ -750,9 +751,9 @@ def curves(
 ) -> None:
     """Learning curves of a benchmark with their deviation over seeds (figure 9)."""
     with clear_errors():
-        from search import plots
-        from search import table as tables
-        from search.benchmark import read_curves
+        from search.results import plots
+        from search.results import table as tables
+        from search.studies.benchmark import read_curves
 
         _write_figure(plots.learning_curves_plot(read_curves(folder), smooth), out or folder / "curves.png")
         _show_missing(tables.read_runs(folder))
@@ -762,7 +763,7 @@ def curves(
 def rankings(folder: Run = None, storage: Storage = None, study: StudyName = None, top: Top = 10, out: Out = None) -> None:
     """Learning curves of the best candidates under three metrics (figure 10)."""
     with clear_errors():
-        from search import analysis, plots
+        from search.results import analysis, plots
 
         studies = _open_studies(None if folder is None else [folder], storage, None if study is None else [study])
         ((of, _),) = studies.values()
@@ -780,7 +781,7 @@ def patterns(
 ) -> None:
     """Scores with and without each pattern of table 5 (figure 11)."""
     with clear_errors():
-        from search import analysis, plots
+        from search.results import analysis, plots
 
         studies = _open_studies(folders, storage, study)
         tables = {name: analysis.trial_table(of.get_trials(deepcopy=False)) for name, (of, _) in studies.items()}
@@ -789,7 +790,7 @@ def patterns(
 
 def _patterns(others: list[str] | None) -> "dict[str, str | AuxLoss]":
     """Those of table 5, and others under their notation."""
-    from search import analysis
+    from search.results import analysis
 
     return {**analysis.PATTERNS, **{text: text for text in others or ()}}
 
@@ -811,7 +812,7 @@ def _write_figure(figure: "Figure", path: Path) -> None:
 
 def _open_studies(folders: list[Path] | None, storage: str | None, names: list[str] | None) -> "dict[str, tuple[Study, Path]]":
     """Studies and their folders by name, one of each folder or several of one storage; by folder where names are alike."""
-    from search.storage import load_study, open_storage
+    from search.execution.storage import load_study, open_storage
 
     given: list[Path | None] = [*folders] if folders else [None]
     places = [_search_folder(folder, storage, benchmarks=False) for folder in given]
@@ -835,7 +836,7 @@ def _search_folder(run: Path | None, storage: str | None, benchmarks: bool = Tru
 
     Benchmarks leave a study too, of runs without candidates, which can be watched but teach nothing about losses.
     """
-    from search.provenance import ABOUT
+    from search.training.provenance import ABOUT
 
     def is_benchmark(folder: Path) -> bool:
         return any(folder.glob(f"*/*/*/{ABOUT}"))

@@ -21,9 +21,9 @@ from optuna_dashboard._note import get_note_from_system_attrs
 from optuna_dashboard.artifact import get_artifact_path
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.notation import subscripts
-from search.plots import evolution_figure, learning_curve_png
-from search.trials import curve_of, lineage, loss_of, operation_of, parents_of, score_of, stage_of, trained_loss_of
+from search.results.notation import subscripts
+from search.results.plots import evolution_figure, learning_curve_png
+from search.results.trials import curve_of, lineage, loss_of, operation_of, parents_of, score_of, stage_of, trained_loss_of
 
 ARTIFACTS = "artifacts"  # folder of the pictures in notes
 PLOT_ID = "evolution"
@@ -63,7 +63,7 @@ def annotate_study(study: Study, settings: Mapping[str, Any], provenance: Mappin
 
     :param study: The study
     :param settings: Names and values of its settings
-    :param provenance: As ``search.provenance.provenance`` gives it
+    :param provenance: As ``search.training.provenance.provenance`` gives it
     :param is_search: False for a list of given runs
     """
     title = "Search for auxiliary losses" if is_search else "Trainings"

@@ -572,7 +572,7 @@ def _checked_hyperparameters(values: Mapping[str, Any], env_id: str, where: str)
 
 def _check(config: SearchConfig, where: str) -> None:
     """What a whole search would stumble on after hours."""
-    from search.sampler import AuxLossSampler  # not above: a training alone needs neither Optuna nor scikit-learn
+    from search.evolution.sampler import AuxLossSampler  # not above: a training alone needs neither Optuna nor scikit-learn
 
     def check(holds: bool, problem: str) -> None:
         if not holds:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.space import MAX_HORIZON, Bits, is_valid, random_operator
+from search.evolution.space import MAX_HORIZON, Bits, is_valid, random_operator
 
 
 class RejectedLoss(ValueError):

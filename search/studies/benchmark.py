@@ -16,12 +16,12 @@ import torch as th
 from sb3_aarl import catalog
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
-from search.config import ConfigError, action_repeat, load_hyperparameters, named_environments, resolve_env_id
-from search.grid import SCORELESS, Cell, all_cells, check_training
-from search.objective import end_noted, mean_curve
-from search.provenance import ABOUT, provenance, read_about, write_about
-from search.storage import open_storage
-from search.training import check_actions, train_candidate
+from search.execution.matrix import SCORELESS, Cell, all_cells, check_training
+from search.execution.storage import open_storage
+from search.studies.objective import end_noted, mean_curve
+from search.training.config import ConfigError, action_repeat, load_hyperparameters, named_environments, resolve_env_id
+from search.training.provenance import ABOUT, provenance, read_about, write_about
+from search.training.run import check_actions, train_candidate
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)

@@ -18,8 +18,8 @@ import joblib  # type: ignore[import-untyped]
 import torch as th
 from optuna.exceptions import StorageInternalError
 
-from search.passwords import without_password
-from search.storage import root_cause
+from search.execution.passwords import without_password
+from search.execution.storage import root_cause
 
 logger = logging.getLogger(__name__)
 

@@ -25,10 +25,11 @@ from optuna.study._optimize import _run_trial
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
-from search import mutations, space, workers
-from search.space import MAX_HORIZON, check_operators
-from search.token_model import TokenModel
-from search.trials import loss_of
+from search.evolution import mutations, space
+from search.evolution.space import MAX_HORIZON, check_operators
+from search.evolution.surrogate import TokenModel
+from search.execution import workers
+from search.results.trials import loss_of
 
 logger = logging.getLogger(__name__)
 
@@ -232,7 +233,7 @@ class AuxLossSampler(BaseGASampler):
 
     A candidate that fails makes room for another one. One whose program ended is given out again: at Ctrl-C, and when
     ``study.optimize`` does not ``catch`` its exception, in which case it is one of the ``retries``. The same holds for a trial
-    that has the user attribute ``interrupted``, which ``search.objective.end_noted`` sets.
+    that has the user attribute ``interrupted``, which ``search.studies.objective.end_noted`` sets.
     """
 
     def __init__(

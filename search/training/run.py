@@ -29,9 +29,18 @@ from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
 from sb3_aarl.envs import PREFIX, make_dmc_env, wrap_env
-from search.checkpoint import CheckpointError, ResumableEnv, is_disk_error, key_path, opened, seal, sync_folder, user_key
-from search.config import VEC_ENVS, ConfigError, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
-from search.provenance import provenance, read_about, write_about
+from search.training.checkpoint import (
+    CheckpointError,
+    ResumableEnv,
+    is_disk_error,
+    key_path,
+    opened,
+    seal,
+    sync_folder,
+    user_key,
+)
+from search.training.config import VEC_ENVS, ConfigError, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
+from search.training.provenance import provenance, read_about, write_about
 
 logger = logging.getLogger(__name__)
 
@@ -154,8 +163,8 @@ def train_candidate(
     generators and simulation are as they were, and on a CPU it ends bit for bit like one that was not killed. Where the
     simulation cannot be saved (an environment that does not pickle, or without its state as Gymnasium's MuJoCo tasks), the
     episode that ran is cut off (the buffer takes it for truncated) and one with another seed begins; a line of log says so.
-    Checkpoints are signed with a key of the user's, see ``search.checkpoint``: one that is torn, of another user or of
-    other settings is refused before anything of it is unpickled, and the training begins anew. When it is over, for
+    Checkpoints are signed with a key of the user's, see ``search.training.checkpoint``: one that is torn, of another user or
+    of other settings is refused before anything of it is unpickled, and the training begins anew. When it is over, for
     whatever reason but an interruption, the death of an environment's process or an error of the disk, the checkpoint is
     removed and ``curve.csv`` stays; a training whose curve is complete is not repeated.
 

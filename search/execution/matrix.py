@@ -16,14 +16,14 @@ from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
-from search import workers
-from search.config import SearchConfig
-from search.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts
-from search.objective import CandidateFailed, DiskError, Objective, disk_problem
-from search.pool import Unfit, WorkerPool, uninterrupted
-from search.provenance import provenance
-from search.storage import PATIENCE, open_storage, study_id
-from search.training import DeviceError, check_actions
+from search.execution import workers
+from search.execution.local import Unfit, WorkerPool, uninterrupted
+from search.execution.storage import PATIENCE, open_storage, study_id
+from search.results.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts
+from search.studies.objective import CandidateFailed, DiskError, Objective, disk_problem
+from search.training.config import SearchConfig
+from search.training.provenance import provenance
+from search.training.run import DeviceError, check_actions
 
 # How often a run is tried that fails, and one whose worker dies: it goes on from its checkpoint.
 MAX_TRIES = 3

@@ -22,8 +22,8 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial
 
 from sb3_aarl.aux_loss import AuxLoss
-from search import analysis
-from search.trials import curve_of, loss_of, operation_of, score_of, stage_of
+from search.results import analysis
+from search.results.trials import curve_of, loss_of, operation_of, score_of, stage_of
 
 # Lines differ by dash and marker, not by colour alone: they have to be told apart in grey.
 DASHES = ("dash", "dot", "dashdot", "longdash", "longdashdot")

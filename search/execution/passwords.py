@@ -19,7 +19,7 @@ def storage_name(where: str) -> str:
     """
     What messages call a storage.
 
-    :param where: As for ``search.storage.open_storage``, or another argument of a program
+    :param where: As for ``search.execution.storage.open_storage``, or another argument of a program
     :return: The same without a password, even if it is a URL with an error
     """
     if "://" not in where:

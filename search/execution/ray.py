@@ -15,9 +15,17 @@ from typing import Any
 
 import joblib  # type: ignore[import-untyped]
 
-from search.passwords import storage_name, without_password
-from search.pool import INTERRUPT_SECONDS, Unfit, WorkerError, _interrupt_again, _interrupt_once, count_death, message
-from search.storage import is_local
+from search.execution.local import (
+    INTERRUPT_SECONDS,
+    Unfit,
+    WorkerError,
+    _interrupt_again,
+    _interrupt_once,
+    count_death,
+    message,
+)
+from search.execution.passwords import storage_name, without_password
+from search.execution.storage import is_local
 
 try:
     import ray
@@ -329,7 +337,7 @@ def check_storage(where: str) -> None:
     """
     Refuse a storage that only this machine has, if the cluster that this process has joined has nodes on others.
 
-    :param where: The storage, as for :func:`search.storage.open_storage`
+    :param where: The storage, as for :func:`search.execution.storage.open_storage`
     :raises ValueError: naming the machines that cannot reach it
     """
     if not is_local(where):

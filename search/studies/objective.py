@@ -19,12 +19,13 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation
-from search.checkpoint import is_disk_error
-from search.config import SearchConfig
-from search.provenance import commit, cpu, versions
-from search.space import distributions, suggest_aux_loss
-from search.storage import study_id
-from search.training import (
+from search.evolution.space import distributions, suggest_aux_loss
+from search.execution.storage import study_id
+from search.execution.workers import DIED_KEY
+from search.training.checkpoint import is_disk_error
+from search.training.config import SearchConfig
+from search.training.provenance import commit, cpu, versions
+from search.training.run import (
     DeviceError,
     EnvironmentLost,
     TrainingError,
@@ -33,7 +34,6 @@ from search.training import (
     memory_problem,
     train_candidate,
 )
-from search.workers import DIED_KEY
 
 # The words of SQLite and PostgreSQL for a disk that cannot be written.
 DISK_MESSAGES = (

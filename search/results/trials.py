@@ -7,7 +7,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.space import params_to_loss
+from search.evolution.space import params_to_loss
 
 # User attribute: list of [environment steps, mean return, standard deviation].
 CURVE_KEY = "curve"

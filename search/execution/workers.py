@@ -132,7 +132,7 @@ def fail_dead(
 
     Of this machine it is known at once which workers have died. Of all machines, and of workers that were stopped, it is
     known by the signs of life of their trials, where the storage keeps them and this process keeps looking: once a heartbeat
-    interval at least, for about two of them (see :class:`search.storage.WithHeartbeat`). No callback of the
+    interval at least, for about two of them (see :class:`search.execution.storage.WithHeartbeat`). No callback of the
     storage makes a copy of them: who looks waits for a place itself, and could not take the copy's.
 
     :param study: The study

@@ -9,9 +9,9 @@ import yaml
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
-from search.config import ConfigError, SearchConfig
-from search.grid import Grid, Variant
-from search.trials import loss_of, ranked
+from search.execution.matrix import Grid, Variant
+from search.results.trials import loss_of, ranked
+from search.training.config import ConfigError, SearchConfig
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The candidates by their mean AULC over all environments (paper, A.4), the best first.
 
-    :param runs: As :func:`search.grid.scores` gives them
+    :param runs: As :func:`search.execution.matrix.scores` gives them
     :return: One row a candidate: mean score on each environment, then ``mean``, ``std`` (sample deviation
         over seeds of the mean over environments), and ``runs``
     """

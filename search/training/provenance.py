@@ -16,7 +16,7 @@ from typing import Any
 import torch as th
 
 from sb3_aarl.callbacks import replace_text
-from search.passwords import storage_name
+from search.execution.passwords import storage_name
 
 # Of a run, in its folder.
 ABOUT = "provenance.json"
@@ -31,7 +31,7 @@ def commit() -> str:
     no checkout, or an installation that lies in somebody else's. It is looked up once: a process keeps the code that it has
     begun with, whatever is checked out later.
     """
-    root = Path(__file__).parent.parent
+    root = Path(__file__).parents[2]
 
     def git(*arguments: str) -> bytes:
         return subprocess.run(["git", *arguments], cwd=root, capture_output=True, check=True).stdout.strip()
@@ -72,7 +72,7 @@ def versions() -> str:
 def provenance() -> dict[str, str]:
     """What has to stand beside every figure: commit, command, date, hardware, versions."""
     name = Path(sys.argv[0]).name
-    program = "aarl" if name == "cli.py" else name  # that is python -m search.cli
+    program = "aarl" if name == "main.py" else name  # that is python -m search.cli.main
     return {
         "commit": commit(),
         # It stands in notes and reports, which others read.

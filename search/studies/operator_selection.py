@@ -6,8 +6,8 @@ import pandas as pd
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS
-from search.config import ConfigError, SearchConfig
-from search.grid import Grid, Variant
+from search.execution.matrix import Grid, Variant
+from search.training.config import ConfigError, SearchConfig
 
 WITH, WITHOUT = "w/ negative samples", "w/o negative samples"
 
@@ -38,7 +38,7 @@ def table(runs: pd.DataFrame) -> pd.DataFrame:
     its environment, so that environments count alike and higher is better even if returns are negative, and then all by
     the best operator's mean, so that this is 1; unless it is negative.
 
-    :param runs: As :func:`search.grid.scores` gives them; ``last`` is the return at the last checkpoint
+    :param runs: As :func:`search.execution.matrix.scores` gives them; ``last`` is the return at the last checkpoint
     :return: One row an operator: ``mean``, ``std``, ``runs``, the best first
     """
     scale = runs.groupby("environment")["last"].transform("mean").abs()

@@ -24,15 +24,17 @@ from rich.text import Text
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
-from search import analysis, cross_validation, grid
-from search import table as tables
-from search.benchmark import read_curves, task_name
-from search.notation import mathml
-from search.plots import evolution_figure, learning_curves_figure, learning_curves_plot, patterns_plot, rankings_plot
-from search.sampler import SETTINGS_KEY
-from search.storage import load_study
-from search.trials import lineage, loss_of, operation_of, parents_of, ranked, score_of, stage_of
-from search.workers import DIED_KEY
+from search.evolution.sampler import SETTINGS_KEY
+from search.execution import matrix as grid
+from search.execution.storage import load_study
+from search.execution.workers import DIED_KEY
+from search.results import analysis
+from search.results import table as tables
+from search.results.notation import mathml
+from search.results.plots import evolution_figure, learning_curves_figure, learning_curves_plot, patterns_plot, rankings_plot
+from search.results.trials import lineage, loss_of, operation_of, parents_of, ranked, score_of, stage_of
+from search.studies import cross_validation
+from search.studies.benchmark import read_curves, task_name
 
 N_BEST = 10
 N_CURVES = 5
@@ -149,7 +151,7 @@ def write_report(
     :param path: Where the HTML file goes; its folder is made if it is not there
     :param baselines: Names and scores to compare with
     :param settings: Names and values of the search's settings; None for what the study itself has noted
-    :param provenance: Of the report, as ``search.provenance.provenance`` gives it
+    :param provenance: Of the report, as ``search.training.provenance.provenance`` gives it
     :param validation: Runs of the cross-validation, as :func:`stored_runs` gives them
     :param benchmark: Folder of a benchmark whose tables and learning curves are shown too
     :raises ValueError: when there is no benchmark in the folder

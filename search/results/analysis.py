@@ -22,9 +22,9 @@ from scipy.stats import kendalltau, spearmanr, ttest_ind
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import KINDS, AuxLoss
-from search import workers
-from search.space import distributions, loss_to_params
-from search.trials import curve_of, lineage, loss_of, operation_of, parents_of, ranked, score_of, stage_of
+from search.evolution.space import distributions, loss_to_params
+from search.execution import workers
+from search.results.trials import curve_of, lineage, loss_of, operation_of, parents_of, ranked, score_of, stage_of
 
 # Section 3.3, in the order of table 5.
 PATTERNS: Mapping[str, str | AuxLoss] = {

@@ -17,10 +17,10 @@ from scipy import stats
 
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
-from search import operator_selection
-from search.benchmark import read_abouts, task_name
-from search.grid import comparable
-from search.provenance import ABOUT
+from search.execution.matrix import comparable
+from search.studies import operator_selection
+from search.studies.benchmark import read_abouts, task_name
+from search.training.provenance import ABOUT
 
 # Resamples of the bootstrap.
 RESAMPLES = 9999
@@ -92,7 +92,7 @@ def read_runs(folder: Path) -> pd.DataFrame:
     ``aarl benchmark``, and ``episodes`` (of an evaluation; 0 if that is not known).
 
     :param folder: Folder of a benchmark; runs that were copied there from another machine count too
-    :raises ValueError: when there are none, when one cannot be read, and as :func:`search.benchmark.read_abouts` does
+    :raises ValueError: when there are none, when one cannot be read, and as :func:`search.studies.benchmark.read_abouts` does
     """
     rows: list[tuple[Any, ...]] = []
     abouts, unreadable = read_abouts(folder)
@@ -165,10 +165,10 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     means, 2 sqrt(s^2 / n + S^2 / N), with s and n of the runs here, S and N of the paper's table; the paper does not say
     which deviation it prints. With one run here there is no s, and no mark.
 
-    For table 6 the returns are normalized as for table 2, see :func:`search.operator_selection.table`: the paper says for
-    neither how. N is 5 seeds x 6 environments there. Both deviations then have the difference of the environments in them,
-    which makes the test a cautious one. What the returns are normalized by are the variants that are complete: if these are
-    not the paper's four, no number of the paper stands beside them.
+    For table 6 the returns are normalized as for table 2, see :func:`search.studies.operator_selection.table`: the paper
+    says for neither how. N is 5 seeds x 6 environments there. Both deviations then have the difference of the environments
+    in them, which makes the test a cautious one. What the returns are normalized by are the variants that are complete: if
+    these are not the paper's four, no number of the paper stands beside them.
 
     :param runs: As :func:`read_runs` gives them
     :param number: 3, 4 or 6, None for no table of the paper

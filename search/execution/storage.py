@@ -33,7 +33,7 @@ from sqlalchemy import URL, create_engine, inspect
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError, PendingRollbackError, SQLAlchemyError
 
-from search.passwords import storage_name, without_password
+from search.execution.passwords import storage_name, without_password
 
 if sys.platform != "win32":
     import fcntl

@@ -16,16 +16,17 @@ from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
-from search import grid, workers
-from search.config import SearchConfig, dump, load_config
-from search.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts, update_plots
-from search.objective import CandidateFailed, DiskError, Objective, causes, check_study, disk_problem, make_pruner
-from search.pool import Pool, Unfit, WorkerError, uninterrupted
-from search.provenance import provenance
-from search.sampler import AuxLossSampler, SearchComplete, StageProgress
-from search.storage import HEARTBEAT_INTERVAL, PATIENCE, Outlasting, ServerLost, load_study, open_storage
-from search.training import DeviceError, check_actions
-from search.trials import loss_of, ranked
+from search.evolution.sampler import AuxLossSampler, SearchComplete, StageProgress
+from search.execution import matrix as grid
+from search.execution import workers
+from search.execution.local import Pool, Unfit, WorkerError, uninterrupted
+from search.execution.storage import HEARTBEAT_INTERVAL, PATIENCE, Outlasting, ServerLost, load_study, open_storage
+from search.results.dashboard import annotate_ended, annotate_study, annotate_trial, artifacts, update_plots
+from search.results.trials import loss_of, ranked
+from search.studies.objective import CandidateFailed, DiskError, Objective, causes, check_study, disk_problem, make_pruner
+from search.training.config import SearchConfig, dump, load_config
+from search.training.provenance import provenance
+from search.training.run import DeviceError, check_actions
 
 logger = logging.getLogger(__name__)
 
