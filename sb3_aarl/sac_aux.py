@@ -42,6 +42,8 @@ EXPLODED = 1000.0
 # The largest log density of a squashed Gaussian for each dimension of an action: SB3 clips the log standard deviation at -20,
 # and takes the slope of tanh for 1e-6 at least.
 LARGEST_LOG_DENSITY = 34.0
+# Plain attributes that training changes.
+TRAINING_VALUES = ("num_timesteps", "_n_updates", "_n_aux_skipped", "_episode_num", "_largest_reward", "_first_error")
 
 
 class NonFiniteError(FloatingPointError, ValueError):
@@ -852,6 +854,29 @@ class SACAux(SAC):
         if self._graphed_step is not None:
             # What was recorded reads and writes the tensors that the optimizers had before.
             self._graphed_step = GraphedStep(self._gradient_step, self.device)
+
+    def training_state(self) -> dict[str, Any]:
+        """
+        All that training changes in the model, as tensors and plain values: ``torch.load(weights_only=True)`` reads it.
+
+        Neither the replay buffer, nor the environment, nor random generators are part of it.
+        """
+        tensors = {name: getattr(self, name).detach() for name in self._get_torch_save_params()[1]}
+        values = {name: getattr(self, name) for name in TRAINING_VALUES}
+        return copy.deepcopy({"parameters": self.get_parameters(), "tensors": tensors, "values": values})
+
+    def load_training_state(self, state: Mapping[str, Any]) -> None:
+        """
+        Continue from the state of another model with the same settings.
+
+        :param state: A return value of :meth:`training_state`
+        """
+        # Copied, since PyTorch's optimizers keep the tensors that they load.
+        self.set_parameters(copy.deepcopy(state["parameters"]), device=self.device)
+        for name, value in state["tensors"].items():
+            getattr(self, name).data.copy_(value)
+        for name in TRAINING_VALUES:
+            setattr(self, name, state["values"][name])
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
