@@ -1,0 +1,182 @@
+"""Runs at an executor: ``start_run``, which every executor gets, resubmission, and an executor of this machine's processes."""
+
+import logging
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from sb3_aarl.callbacks import Evaluation, read_curve
+from search.training.run import Run, is_finished, prepare_run, read_outcome
+
+logger = logging.getLogger(__name__)
+
+OUTPUT = "output.log"
+CURVE = "curve.csv"
+STOP = "stop"
+
+
+class RunFailed(RuntimeError):
+    """Candidate after candidate failed, or runs could not be started; the message has the last reason."""
+
+
+class Future(Protocol):
+    """What ``submit`` returns: futures of ``concurrent.futures``, Ray and Dask, jobs of submitit."""
+
+    def done(self) -> bool: ...
+
+    def result(self) -> Any: ...
+
+
+class Executor(Protocol):
+    """Anything that runs a function somewhere."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future: ...
+
+
+_processes: set[subprocess.Popen[bytes]] = set()
+_shutting_down = threading.Event()
+
+
+def start_run(folder: str) -> dict[str, Any]:
+    """
+    Train the run of a folder in a process of its own, which ends when this one does, and wait for it.
+
+    It is the one function that executors get. A run that is finished is read, not trained again.
+
+    :param folder: Absolute path of a folder that ``prepare_run`` has prepared
+    :return: Plain values: ``curve`` (rows of ``Evaluation``), ``failure`` (None, or the reason in one line) and ``retry``
+        (whether the failure was not the candidate's fault)
+    """
+    path = Path(folder)
+    if not is_finished(path):
+        threads = str(Run.model_validate_json((path / "run.json").read_text(encoding="utf-8")).threads)
+        command = [sys.executable, "-m", "search.training.run", folder, "--end-with-stdin"]
+        environment = {**os.environ, "OMP_NUM_THREADS": threads}
+        # A session of its own: Ctrl-C reaches the driver only, whose end closes the pipe.
+        with (path / OUTPUT).open("ab") as output:
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment, start_new_session=True
+            )
+        _processes.add(process)
+        try:
+            if _shutting_down.is_set():
+                process.kill()
+            code = process.wait()
+        finally:
+            _processes.discard(process)
+            if process.stdin is not None:
+                process.stdin.close()
+        if code and read_outcome(path) is None:
+            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            return {
+                "curve": _rows(path),
+                "failure": f"the run's process was killed ({how}), see {path / OUTPUT}",
+                "retry": True,
+            }
+    outcome = read_outcome(path)
+    if outcome is None:  # it was told to stop
+        return {"curve": _rows(path), "failure": None, "retry": False}
+    return {"curve": [list(row) for row in outcome.curve], "failure": outcome.failure, "retry": outcome.retry}
+
+
+def _rows(folder: Path) -> list[list[float]]:
+    return [list(row) for row in partial_curve(folder)]
+
+
+def partial_curve(folder: Path) -> list[Evaluation]:
+    """
+    The learning curve of a run so far.
+
+    :param folder: Folder of the run
+    """
+    path = folder / CURVE
+    return read_curve(path) if path.exists() else []
+
+
+def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
+    """
+    The learning curve over several seeds.
+
+    :param curves: One for each seed, with equally many episodes; the shortest decides the length
+    :return: [environment steps, mean, standard deviation] over the episodes of all seeds, for every evaluation
+    """
+    points = []
+    for evaluations in zip(*curves, strict=False):
+        means, deviations = np.array([(evaluation.mean, evaluation.std) for evaluation in evaluations]).T
+        # The variance of all episodes: within the seeds, and between them.
+        std = float(np.sqrt((deviations**2).mean() + means.var()))
+        points.append([evaluations[0].environment_steps, float(means.mean()), std])
+    return points
+
+
+class LocalExecutor(ThreadPoolExecutor):
+    """
+    Processes of this machine: each thread starts one and waits for it. Leaving the ``with`` block ends those that run.
+
+    :param workers: How many run at the same time
+    """
+
+    def __init__(self, workers: int = 1):
+        super().__init__(workers, thread_name_prefix="run")
+        _shutting_down.clear()
+
+    def __exit__(self, *exception: Any) -> None:
+        _shutting_down.set()  # for threads that are just starting a process
+        for process in list(_processes):
+            process.kill()
+        self.shutdown(wait=True, cancel_futures=True)
+
+
+class Submission:
+    """
+    One run at an executor; resubmitted while its process is killed, or something else fails that is not the run's fault.
+
+    :param executor: The executor
+    :param folder: Folder of the run
+    :param run: The run
+    :param retries: How often it is resubmitted
+    """
+
+    def __init__(self, executor: Executor, folder: Path, run: Run, retries: int):
+        self.executor = executor
+        self.folder = folder.absolute()
+        self.run = run
+        self.retries = retries
+        self.curve: list[Evaluation] = []
+        self.failure: str | None = None
+        self._over = False
+        self._submit()
+
+    def _submit(self) -> None:
+        prepare_run(self.folder, self.run)
+        self.future = self.executor.submit(start_run, str(self.folder))
+
+    def stop(self) -> None:
+        """End the run at its next evaluation."""
+        (self.folder / STOP).touch()
+
+    def done(self) -> bool:
+        """Whether the run is over: then ``curve`` and ``failure`` (None, or the reason) are there."""
+        if self._over or not self.future.done():
+            return self._over
+        try:
+            result = self.future.result()
+        except Exception as error:  # of the executor: its worker or node is lost
+            reason = " ".join(f"{type(error).__name__}: {error}".split())[:500]
+            result = {"curve": [], "failure": reason, "retry": True}
+        if result["failure"] is not None and result["retry"] and self.retries > 0:
+            self.retries -= 1
+            logger.warning("%s is resubmitted: %s", self.folder, result["failure"])
+            self._submit()
+            return False
+        self.curve = [Evaluation(*row) for row in result["curve"]]
+        self.failure = result["failure"]
+        self._over = True
+        return True
