@@ -1,154 +1,27 @@
 """The paper's benchmark: variants (files of hyper-parameters) x tasks x seeds, every run in a folder of its own."""
 
-import itertools
+import json
 import re
-import reprlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import optuna
 import pandas as pd
-import torch as th
 
 from sb3_aarl import catalog
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
-from search.execution.matrix import SCORELESS, Cell, all_cells, check_training
-from search.execution.storage import open_storage
-from search.studies.objective import end_noted, mean_curve
+from search.execution.matrix import Cell, Matrix, all_cells, cell_folder, task_name
 from search.training.config import ConfigError, action_repeat, load_hyperparameters, named_environments, resolve_env_id
-from search.training.provenance import ABOUT, provenance, read_about, write_about
-from search.training.run import check_actions, train_candidate
+from search.training.provenance import ABOUT, read_about
+from search.training.run import Run, check_run
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
 UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
-
-
-@dataclass(frozen=True)
-class Benchmark:
-    """
-    Variants x environments x seeds, as ``grid.run`` trains them.
-
-    :param files: Files of hyper-parameters by variant
-    :param hyperparameters: What they say, by variant and environment; each has an ``aux_loss``
-    :param checkpoints: Environment steps by environment, ascending: what is compared; the last one ends the training
-    :param seeds: Seeds of the trainings
-    :param every: Environment steps after which it is also evaluated, None for at the checkpoints only
-    :param evaluation_episodes: Episodes of each evaluation
-    :param name: Of the study that the runs are shared out in
-    """
-
-    files: Mapping[str, str]
-    hyperparameters: Mapping[str, Mapping[str, Mapping[str, Any]]]
-    checkpoints: Mapping[str, Sequence[int]]
-    seeds: Sequence[int]
-    every: int | None = None
-    evaluation_episodes: int = 10
-    name: str = "benchmark"
-
-    @property
-    def cells(self) -> list[Cell]:
-        return all_cells(self.files, self.checkpoints, self.seeds)
-
-    @property
-    def trainings(self) -> dict[str, dict[str, Any]]:
-        """What decides the scores, as ``grid.check_training`` takes it."""
-        return {
-            f"{variant} on {environment}": {
-                "evaluations": self.evaluations(environment),
-                "evaluation_episodes": self.evaluation_episodes,
-                **self.hyperparameters[variant][environment],
-            }
-            for variant, environment in itertools.product(self.files, self.checkpoints)
-        }
-
-    def evaluations(self, environment: str) -> list[int]:
-        """
-        The environment steps of all evaluations.
-
-        :param environment: Id of the environment
-        """
-        checkpoints = self.checkpoints[environment]
-        between = range(self.every, checkpoints[-1], self.every) if self.every else ()
-        return sorted({*checkpoints, *between})
-
-    def about(self, cell: Cell) -> dict[str, Any]:
-        """
-        What is needed to repeat a run, in plain values; where and when it was trained comes with the training.
-
-        :param cell: The run
-        """
-        settings = self.hyperparameters[cell.variant][cell.environment]
-        return {
-            **cell._asdict(),
-            "checkpoints": list(self.checkpoints[cell.environment]),
-            "evaluations": self.evaluations(cell.environment),
-            "evaluation_episodes": self.evaluation_episodes,
-            "file": self.files[cell.variant],
-            "hyperparameters": dict(settings),
-            "sessions": [],
-        }
-
-    def train(self, trial: optuna.Trial, cell: Cell, folder: Path) -> float:
-        """
-        Train one run, or go on with it: ``curve.csv`` and ``provenance.json`` in its folder.
-
-        :param trial: Gets the learning curve as the user attribute ``curve``, or the ``reason`` why it failed
-        :param cell: The run
-        :param folder: Folder of the benchmark
-        :return: AULC
-        :raises CandidateFailed: when the training diverges, runs out of memory or its environment breaks
-        """
-        settings = dict(self.hyperparameters[cell.variant][cell.environment])
-        loss = settings.pop("aux_loss")
-        path = run_folder(folder, cell)
-        about = self.about(cell)
-        # A run that was killed and goes on has several.
-        session = {**provenance(), "threads": th.get_num_threads()}
-        about["sessions"] = [*read_about(path).get("sessions", ()), session]
-        write_about(path, about)
-        with end_noted(trial, path):
-            run = train_candidate(
-                cell.environment,
-                loss if loss in (None, "auto") else catalog.resolve(loss),
-                settings,
-                cell.seed,
-                about["evaluations"],
-                self.evaluation_episodes,
-                path,
-            )
-        trial.set_user_attr("curve", mean_curve([run.curve]))
-        session["aux_loss"] = run.aux_loss
-        write_about(path, {**about, "seconds": run.curve[-1].seconds})
-        return run.aulc
-
-    def prepare(self, folder: Path) -> None:
-        """
-        Leave in each run's folder what is asked for: a table can say what is missing. Runs that are there and were evaluated
-        at the same steps get the checkpoints of now.
-
-        :param folder: Folder of the benchmark
-        :raises ValueError: when runs that are there were trained in another way
-        """
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        study = optuna.create_study(
-            study_name=self.name, storage=open_storage(folder), direction="maximize", load_if_exists=True
-        )
-        check_training(study, self.trainings)
-        for cell in self.cells:
-            path = run_folder(folder, cell)
-            if not (path / ABOUT).exists():
-                write_about(path, self.about(cell))
-        for path, about in read_abouts(folder)[0].items():
-            environment = about["environment"]
-            of_now = list(self.checkpoints.get(environment, ()))
-            # Written only where it differs: a worker of another program may be adding to it.
-            if of_now not in ([], about.get("checkpoints")) and about.get("evaluations") == self.evaluations(environment):
-                write_about(path, {**read_about(path), "checkpoints": of_now})
+# Settings that change no score.
+SCORELESS = ("n_timesteps", "device")
 
 
 def load_benchmark(
@@ -158,132 +31,111 @@ def load_benchmark(
     checkpoints: Sequence[int] = (),
     every: int | None = None,
     evaluation_episodes: int = 10,
-) -> Benchmark:
+    threads: int = 1,
+    folder: Path = Path("runs/benchmark"),
+) -> Matrix:
     """
     Read the variants of a benchmark, and check all that can be checked without training.
 
     :param files: Files of hyper-parameters, as ``load_hyperparameters`` reads them; the variants have their names
     :param environments: Ids or short forms; none for those that all files name
-    :param seeds: Seeds of the trainings on each
+    :param seeds: Seeds of the runs on each
     :param checkpoints: Environment steps of the comparison, ascending; none for those of 100k, 500k and 1000k that lie in
         every file's ``n_timesteps``
-    :param every: Environment steps after which it is also evaluated
+    :param every: Environment steps after which runs are also evaluated
     :param evaluation_episodes: Episodes of each evaluation
-    :raises ValueError: naming what is wrong
+    :param threads: Threads of each run
+    :param folder: Folder of the benchmark, which may have runs of other variants, tasks and seeds
+    :raises ValueError: naming what is wrong, or which setting differs from that of runs in the folder
     """
     for stem, count in Counter(path.stem for path in files).items():
         if count > 1:
             raise ConfigError(f"two files are called {stem}: a variant has the name of its file")
-    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0 or max(seeds) >= 2**32:
-        raise ConfigError(f"seeds must be different numbers from 0 to 2**32 - 1, not {reprlib.repr(list(seeds))}")
-    if evaluation_episodes < 1:
-        raise ConfigError(f"episodes must be at least 1, not {evaluation_episodes}")
-    if every is not None and every < 1:
-        raise ConfigError(f"every must be at least 1, not {every}")
-    ids = [resolve_env_id(name) for name in environments] or _common_environments(files)
-    ids = list(dict.fromkeys(ids))
-    for name in ids:
-        check_actions(name)
-    # SACAux's default, written out: a file that says nothing is not one that says none.
+    if len(set(seeds)) < len(seeds) or any(not 0 <= seed < 2**32 for seed in seeds):
+        raise ConfigError(f"seeds must be different numbers from 0 to 2**32 - 1, not {list(seeds)}")
+    names = environments or _common_environments(files)
+    ids = list(dict.fromkeys(resolve_env_id(name) for name in names))
+    # SACAux's default, written out: a file that names no loss is not one that says "none".
     hyperparameters = {
-        path.stem: {name: {"aux_loss": "auto", **load_hyperparameters(path, name)} for name in ids} for path in files
+        (path.stem, name): {"aux_loss": "auto", **load_hyperparameters(path, name)} for path in files for name in ids
     }
-    of_environment = {name: _checkpoints(name, hyperparameters, checkpoints) for name in ids}
+    compared = {name: tuple(checkpoints) or _default_checkpoints(name, hyperparameters) for name in ids}
     paths = {path.stem: str(path) for path in files}
-    benchmark = Benchmark(paths, hyperparameters, of_environment, seeds, every, evaluation_episodes)
-    for (variant, settings), name in itertools.product(hyperparameters.items(), ids):
-        repeat = action_repeat(settings[name])
-        between = [step for step in benchmark.evaluations(name) if step % repeat]
-        if between:
-            raise ConfigError(
-                f"{variant}: evaluations on {name} must be at multiples of its action repeat {repeat}, not {between[0]}"
-            )
-    return benchmark
+    runs: dict[Cell, Run] = {}
+    abouts: dict[Cell, dict[str, Any]] = {}
+    for cell in all_cells(paths, ids, seeds):
+        settings, steps = hyperparameters[cell[:2]], compared[cell.environment]
+        evaluations = _evaluations(steps, every, action_repeat(settings), cell)
+        loss = settings["aux_loss"]
+        runs[cell] = Run(
+            environment=cell.environment,
+            aux_loss=loss if loss in (None, "auto") else str(catalog.resolve(loss)),
+            hyperparameters={key: value for key, value in settings.items() if key != "aux_loss"},
+            seed=cell.seed,
+            checkpoints=evaluations,
+            evaluation_episodes=evaluation_episodes,
+            threads=threads,
+        )
+        # What is needed to repeat the run; where and when it was trained is added by the run.
+        abouts[cell] = {
+            **cell._asdict(),
+            "checkpoints": list(steps),
+            "evaluations": list(evaluations),
+            "evaluation_episodes": evaluation_episodes,
+            "file": paths[cell.variant],
+            "hyperparameters": json.loads(json.dumps(settings)),  # as it is read again
+        }
+    matrix = Matrix("benchmark", folder, runs, abouts)
+    _check_folder(matrix)
+    _check_models(matrix)
+    return matrix
 
 
-def run_folder(folder: Path, cell: Cell) -> Path:
+def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     """
-    Where a run keeps what it makes: ``FOLDER/VARIANT/TASK/seed-N``.
-
-    :param folder: Folder of the benchmark
-    :param cell: The run
-    """
-    return folder / cell.variant / task_name(cell.environment).replace("/", "_") / f"seed-{cell.seed}"
-
-
-def task_name(environment: str) -> str:
-    """
-    The short form of a DeepMind Control task's id; other ids as they are.
-
-    :param environment: Id of the environment
-    """
-    return environment.removeprefix(PREFIX).removesuffix("-v0") if environment.startswith(PREFIX) else environment
-
-
-def read_abouts(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[Path]]:
-    """
-    What stands beside the curves of a benchmark's runs.
+    The ``provenance.json`` of a benchmark's runs, by their folders; ``failed`` is the reason of a run that failed.
 
     :param folder: Folder of a benchmark; runs that were copied there from another machine count too
-    :return: What does, by the runs' folders, and the folders where it cannot be read
-    :raises ValueError: naming two folders that have the same run, or runs of a variant on an environment that were trained
-        in different ways
+    :raises ValueError: naming one that cannot be read, two folders that have the same run, or runs of a variant on an
+        environment that were trained in different ways
     """
     abouts: dict[Path, dict[str, Any]] = {}
-    unreadable: list[Path] = []
-    of_cell: dict[Cell, Path] = {}
+    folders: dict[Cell, Path] = {}
     trained: dict[tuple[str, str], Path] = {}
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{ABOUT}")):
-        about = read_about(path)
-        if not {*Cell._fields, "checkpoints", "sessions"} <= about.keys():
-            unreadable.append(path)
-            continue
+        about = {"sessions": [], **read_about(path)}
+        if not {*Cell._fields, "checkpoints"} <= about.keys():
+            raise ValueError(f"{path / ABOUT} is not that of a benchmark's run")
         abouts[path] = about
+        if (path / "failed.json").exists():
+            about["failed"] = json.loads((path / "failed.json").read_text(encoding="utf-8"))["reason"]
         cell = Cell(*(about[name] for name in Cell._fields))
-        other = of_cell.setdefault(cell, path)
+        other = folders.setdefault(cell, path)
         if other != path:
             raise ValueError(f"{other} and {path} have the same run: {cell.variant} on {cell.environment}, seed {cell.seed}")
         other = trained.setdefault((cell.variant, cell.environment), path)
-        old, new = _training(abouts[other]), _training(about)
-        for key in old | new:
-            if old.get(key) != new.get(key):
-                raise ValueError(f"{other} and {path} cannot be compared: {key}={old.get(key)!r} and {new.get(key)!r}")
-    return abouts, unreadable
+        if difference := _difference(abouts[other], about):
+            raise ValueError(f"{other} and {path} cannot be compared: {'{}={!r} and {!r}'.format(*difference)}")
+    return abouts
 
 
 def read_curves(folder: Path) -> pd.DataFrame:
     """
-    The learning curves of a benchmark's runs, as ``plots.learning_curves_plot`` takes them: one row an evaluation with
-    ``variant``, ``env`` (short form), ``seed``, ``environment_steps``, ``mean`` and ``std`` (of the episodes' returns). Runs
-    that have no evaluation yet are passed over.
+    The learning curves of a benchmark's runs: one row an evaluation with ``variant``, ``env`` (short form), ``seed``,
+    ``environment_steps``, ``mean`` and ``std`` (of the episodes' returns). Runs without an evaluation are skipped.
 
     :param folder: Folder of a benchmark
-    :raises ValueError: when no run has a learning curve, or naming one that cannot be read
+    :raises ValueError: when no run has a learning curve
     """
-    rows = []
-    for path, about in read_abouts(folder)[0].items():
-        curve = path / "curve.csv"
-        if curve.exists():
-            try:
-                run = (about["variant"], task_name(about["environment"]), about["seed"])
-                rows += [(*run, point.environment_steps, point.mean, point.std) for point in read_curve(curve)]
-            except (ValueError, KeyError, TypeError) as error:
-                raise ValueError(f"{path} is not what a benchmark leaves: {type(error).__name__}: {error}") from None
+    rows = [
+        (about["variant"], task_name(about["environment"]), about["seed"], point.environment_steps, point.mean, point.std)
+        for path, about in read_abouts(folder).items()
+        if (path / "curve.csv").exists()
+        for point in read_curve(path / "curve.csv")
+    ]
     if not rows:
         raise ValueError(f"{folder} has no learning curves of a benchmark")
     return pd.DataFrame(rows, columns=["variant", "env", "seed", "environment_steps", "mean", "std"])
-
-
-def note_failures(folder: Path, failures: Mapping[Cell, str]) -> None:
-    """
-    Leave in the folders of runs that failed why they did.
-
-    :param folder: Folder of the benchmark
-    :param failures: As ``grid.given_up`` gives them
-    """
-    for cell, reason in failures.items():
-        path = run_folder(folder, cell)
-        write_about(path, {**read_about(path), "failed": reason})
 
 
 def parse_steps(text: str) -> tuple[int, ...]:
@@ -324,26 +176,59 @@ def _common_environments(files: Iterable[Path]) -> list[str]:
     common = [name for name in first if all(name in names for names in others)]
     if not common:
         raise ConfigError("the files have no entry of one environment in common: name environments")
-    return [resolve_env_id(name) for name in common]
+    return common
 
 
-def _checkpoints(
-    environment: str, hyperparameters: Mapping[str, Mapping[str, Mapping[str, Any]]], asked_for: Sequence[int]
-) -> tuple[int, ...]:
-    """What is compared on an environment."""
-    if asked_for:
-        if sorted(set(asked_for)) != list(asked_for) or asked_for[0] < 1:
-            raise ConfigError(f"checkpoints must be positive environment steps in ascending order, not {list(asked_for)}")
-        return tuple(asked_for)
-    of_environment = [settings[environment] for settings in hyperparameters.values()]
-    budgets = [s["n_timesteps"] * action_repeat(s) for s in of_environment if "n_timesteps" in s]
-    budget = min(budgets, default=CHECKPOINTS[-1])
+def _default_checkpoints(environment: str, hyperparameters: Mapping[tuple[str, str], Mapping[str, Any]]) -> tuple[int, ...]:
+    """The paper's checkpoints that lie in every variant's budget."""
+    settings = [settings for (_, name), settings in hyperparameters.items() if name == environment]
+    budget = min((s["n_timesteps"] * action_repeat(s) for s in settings if "n_timesteps" in s), default=CHECKPOINTS[-1])
     if budget < CHECKPOINTS[0]:
-        raise ConfigError(f"n_timesteps ends the training on {environment} at {budget} environment steps: name checkpoints")
+        raise ConfigError(f"n_timesteps ends the runs on {environment} at {budget} environment steps: name checkpoints")
     return tuple(step for step in CHECKPOINTS if step <= budget)
 
 
-def _training(about: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides a run's scores."""
-    settings = {name: about.get(name) for name in ("evaluation_episodes", "program")} | about.get("hyperparameters", {})
-    return {key: value for key, value in settings.items() if key not in SCORELESS}
+def _evaluations(checkpoints: Sequence[int], every: int | None, repeat: int, cell: Cell) -> tuple[int, ...]:
+    """The environment steps of all evaluations of a run."""
+    if sorted(set(checkpoints)) != list(checkpoints) or checkpoints[0] < 1:
+        raise ConfigError(f"checkpoints must be positive environment steps in ascending order, not {list(checkpoints)}")
+    if every is not None and every < 1:
+        raise ConfigError(f"every must be at least 1, not {every}")
+    between = () if every is None else range(every, checkpoints[-1], every)
+    steps = sorted({*checkpoints, *between})
+    for step in steps:
+        if step % repeat:
+            raise ConfigError(
+                f"{cell.variant}: evaluations on {cell.environment} must be at multiples of its action repeat {repeat}, not {step}"
+            )
+    return tuple(steps)
+
+
+def _check_folder(matrix: Matrix) -> None:
+    """Refuse to add runs to those of a variant on an environment that were trained in another way."""
+    stored = {(about["variant"], about["environment"]): about for about in read_abouts(matrix.folder).values()}
+    for cell, about in matrix.abouts.items():
+        if difference := _difference(stored.get(cell[:2], about), about, "evaluations"):
+            problem = "{}={!r}, not {!r}".format(*difference)
+            raise ValueError(
+                f"{matrix.folder} has runs of {cell.variant} on {cell.environment} with {problem}: name another folder"
+            )
+
+
+def _difference(one: Mapping[str, Any], other: Mapping[str, Any], *keys: str) -> tuple[str, Any, Any] | None:
+    """The first setting in which two runs differ, with both values: their scores cannot be compared."""
+    # Runs that were trained by another program name it.
+    keys = (*keys, "evaluation_episodes", "program")
+    old, new = ({key: about.get(key) for key in keys} | about.get("hyperparameters", {}) for about in (one, other))
+    differing = (key for key in old | new if key not in SCORELESS and old.get(key) != new.get(key))
+    return next(((key, old.get(key), new.get(key)) for key in differing), None)
+
+
+def _check_models(matrix: Matrix) -> None:
+    """Make environment and model of each variant once, and on every environment that may be of the user's own."""
+    checked = set()
+    for cell, run in matrix.runs.items():
+        what = cell.variant if cell.environment.startswith(PREFIX) else cell[:2]
+        if what not in checked:
+            checked.add(what)
+            check_run(run)

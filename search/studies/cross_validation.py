@@ -6,12 +6,16 @@ from pathlib import Path
 import optuna
 import pandas as pd
 import yaml
+from optuna.study import StudyDirection
+from optuna.trial import TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
-from search.execution.matrix import Grid, Variant
-from search.results.trials import loss_of, ranked
-from search.training.config import ConfigError, SearchConfig
+from search.evolution.space import loss_of
+from search.execution.matrix import Cell, Matrix
+from search.studies.config import SearchConfig
+from search.studies.search import make_run
+from search.training.config import ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -24,23 +28,22 @@ def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
     :param top: How many
     :raises ValueError: when no candidate is complete
     """
-    losses: dict[AuxLoss, None] = {}
-    for trial in ranked(study.get_trials(deepcopy=False), study.direction):
-        loss = loss_of(trial)
-        if loss is not None:
-            losses[loss.canonical()] = None
+    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    trials.sort(key=lambda trial: trial.value or 0.0, reverse=study.direction == StudyDirection.MAXIMIZE)
+    losses = dict.fromkeys(loss.canonical() for loss in map(loss_of, trials) if loss is not None)
     if not losses:
         raise ValueError(f"study {study.study_name!r} has no completed candidate yet")
     return list(losses)[:top]
 
 
-def make_grid(config: SearchConfig, study: optuna.Study, top: int | None = None) -> Grid:
+def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, top: int | None = None) -> Matrix:
     """
     The runs of a cross-validation: candidates x environments x seeds.
 
-    :param config: Settings of the search, with a section ``cross_validation``
-    :param study: The search
-    :param top: How many candidates, None for the config's number
+    :param config: The search, with a section ``cross_validation``
+    :param study: Its study
+    :param folder: Its folder; the runs are in its folder ``cross-validation``
+    :param top: How many candidates, None for the configuration's number
     """
     section = config.cross_validation
     if section is None:
@@ -52,22 +55,27 @@ def make_grid(config: SearchConfig, study: optuna.Study, top: int | None = None)
             config.environment,
         )
     losses = top_losses(study, section.top if top is None else top)
-    variants = {str(loss): Variant(loss) for loss in losses}
-    return Grid(f"{study.study_name}-cross-validation", config, variants, section.environments, section.seeds)
+    runs = {
+        Cell(str(loss), environment, seed): make_run(config, environment, loss, seed)
+        for seed in section.seeds
+        for environment in section.environments
+        for loss in losses
+    }
+    return Matrix(f"{study.study_name}-cross-validation", folder / "cross-validation", runs)
 
 
 def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The candidates by their mean AULC over all environments (paper, A.4), the best first.
 
-    :param runs: As :func:`search.execution.matrix.scores` gives them
+    :param runs: As returned by :func:`search.execution.matrix.scores`
     :return: One row a candidate: mean score on each environment, then ``mean``, ``std`` (sample deviation
         over seeds of the mean over environments), and ``runs``
     """
     by_environment = runs.pivot_table(index="variant", columns="environment", values="score", aggfunc="mean")
-    of_seeds = runs.groupby(["variant", "seed"])["score"].mean().groupby("variant")
+    by_seed = runs.groupby(["variant", "seed"])["score"].mean().groupby("variant")
     # The mean of the environments' means: each counts alike, however many seeds it has so far.
-    overall = pd.DataFrame({"mean": by_environment.mean(axis=1), "std": of_seeds.std()})
+    overall = pd.DataFrame({"mean": by_environment.mean(axis=1), "std": by_seed.std()})
     overall["runs"] = runs.groupby("variant")["score"].count()
     return by_environment.join(overall).sort_values("mean", ascending=False)
 
@@ -76,8 +84,8 @@ def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
     """
     Write the best candidate as YAML: a mapping whose ``aux_loss`` is what SACAux and hyper-parameter files take.
 
-    :param table: As :func:`ranking` gives it
-    :param path: Where it goes
+    :param table: As returned by :func:`ranking`
+    :param path: The file
     :return: The best candidate
     """
     winner = AuxLoss.parse(str(table.index[0]))

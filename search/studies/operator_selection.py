@@ -1,33 +1,37 @@
 """Which operator? Ten operators x environments x seeds with forward dynamics (paper, section 2.2, A.1.3, table 2)."""
 
 from dataclasses import replace
+from itertools import product
+from pathlib import Path
 
 import pandas as pd
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS
-from search.execution.matrix import Grid, Variant
-from search.training.config import ConfigError, SearchConfig
+from search.execution.matrix import Cell, Matrix
+from search.studies.config import SearchConfig
+from search.studies.search import make_run
+from search.training.config import ConfigError
 
-WITH, WITHOUT = "w/ negative samples", "w/o negative samples"
+NEGATIVES = {True: "w/ negative samples", False: "w/o negative samples"}
 
 
-def make_grid(config: SearchConfig) -> Grid:
+def make_matrix(config: SearchConfig, folder: Path) -> Matrix:
     """
     The runs: all operators, with and without negatives, on the loss inputs of forward dynamics.
 
-    :param config: Settings of the trainings, with a section ``operator_selection``
+    :param config: The search, with a section ``operator_selection``
+    :param folder: Its folder; the runs are in its folder ``operators``
     """
     section = config.operator_selection
     if section is None:
         raise ConfigError(f"{config.path}: operator_selection is missing: environments, seeds")
     loss = catalog.load("forward-dynamics")
-    variants = {
-        f"{operator}, {WITH if negatives else WITHOUT}": Variant(replace(loss, operator=operator, negatives=negatives))
-        for operator in OPERATORS
-        for negatives in (True, False)
-    }
-    return Grid(f"{config.name}-operators", config, variants, section.environments, section.seeds)
+    runs = {}
+    for seed, environment, operator, negatives in product(section.seeds, section.environments, OPERATORS, NEGATIVES):
+        cell = Cell(f"{operator}, {NEGATIVES[negatives]}", environment, seed)
+        runs[cell] = make_run(config, environment, replace(loss, operator=operator, negatives=negatives), seed)
+    return Matrix(f"{config.name}-operators", folder / "operators", runs)
 
 
 def table(runs: pd.DataFrame) -> pd.DataFrame:
@@ -38,7 +42,7 @@ def table(runs: pd.DataFrame) -> pd.DataFrame:
     its environment, so that environments count alike and higher is better even if returns are negative, and then all by
     the best operator's mean, so that this is 1; unless it is negative.
 
-    :param runs: As :func:`search.execution.matrix.scores` gives them; ``last`` is the return at the last checkpoint
+    :param runs: As returned by :func:`search.execution.matrix.scores`; ``last`` is the return at the last checkpoint
     :return: One row an operator: ``mean``, ``std``, ``runs``, the best first
     """
     scale = runs.groupby("environment")["last"].transform("mean").abs()
