@@ -1,5 +1,6 @@
 # make demo    a small search on DeepMind Control's Cheetah-Run, and a training with what it found
 # make test    all tests, what they need included
+# make check   lint, types, and the tests that are not slow
 # make lint    ruff and mypy
 
 PYTHON ?= python3
@@ -10,7 +11,7 @@ RENDERING := libegl1 libosmesa6 libgl1-mesa-dri
 BROWSER := chromium chromium-driver
 DATABASE := postgresql
 
-.PHONY: demo test lint system clean
+.PHONY: demo test check lint system clean
 
 demo: $(VENV)/.installed
 	$(BIN)/aarl search zoo_configs/search/demo.yml --workers 2
@@ -20,6 +21,9 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.installed-dev system
 	$(BIN)/python -m pytest -n 2
+
+check: lint system
+	$(BIN)/python -m pytest -n 2 -m "not slow"
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -1,196 +1,151 @@
-"""The search for real: the program aarl, worker processes, trainings on dm_control, SIGKILL and Ctrl-C."""
+"""Searches for real: the program aarl, processes that train, SIGKILL, PostgreSQL that restarts, Ray nodes that go."""
 
-import json
 import os
+import random
 import signal
 import subprocess
 import time
-from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import optuna
 import pytest
-import yaml
 from optuna.trial import TrialState
-from optuna_dashboard._custom_plot_data import get_plotly_graph_objects
+from postgres import Postgres
 from program import aarl, start
-from typer.testing import CliRunner
+from tiny import SEARCH, write_search
 
-from sb3_aarl import AuxLoss
-from search.cli.main import app
-from search.evolution.space import params_to_loss
+from search.evolution.space import loss_of
+from search.execution.driver import Driver
 from search.execution.storage import open_storage
+from search.studies.config import load_config
+from search.studies.search import open_search, runs_of
 
-HYPERPARAMETERS = """
-default:
-  env_kwargs: {action_repeat: 8}
-  learning_starts: 20
-  batch_size: 8
-  predictor_width: 8
-  policy_kwargs: {net_arch: [8], features_extractor_kwargs: {features_dim: 8, width: 8}}
-"""
-SEARCH = """
-environment: dm_control/cartpole-balance-v0
-hyperparameters: hyperparameters.yml
-checkpoints: [400, 800]
-evaluation_episodes: 1
-stages: 2
-n_random: 3
-n_prior: 1
-population_size: 4
-parents: 0.5
-max_horizon: 3
-seed: 3
-cross_validation:
-  environments: [dm_control/cartpole-balance-v0, dm_control/reacher-easy-v0]
-  seeds: [0, 1]
-  top: 2
-operator_selection:
-  environments: [dm_control/cartpole-balance-v0]
-  seeds: [0]
-baselines:
-- {name: CURL, aux_loss: curl}
-- {name: SAC}
-"""
+pytestmark = pytest.mark.slow
+Slots = dict[tuple[int, int], tuple[str, float | None]]
+
+
+def slots(folder: Path | None, url: str | None = None) -> Slots:
+    """Loss and score of each slot; a slot has one finished trial."""
+    storage = open_storage(None if folder is None else folder / "runs/small", url, create=False)
+    trials = optuna.load_study(study_name="small", storage=storage).get_trials(states=(TrialState.COMPLETE,))
+    keys = [(trial.user_attrs["generation"], trial.user_attrs["slot"]) for trial in trials]
+    assert len(set(keys)) == len(keys)
+    return dict(zip(keys, [(str(loss_of(trial)), trial.value) for trial in trials], strict=True))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Slots:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    output = aarl("search", write_search(folder), "--workers", 2, folder=folder)
+    assert "8" in output
+    found = slots(folder)
+    assert len(found) == 8
+    return found
+
+
+def runs_of_driver(pid: int) -> list[int]:
+    """Processes that train for a driver."""
+    output = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout
+    return [int(line) for line in output.split()]
+
+
+def test_workers_and_driver_are_killed(tmp_path: Path, undisturbed: Slots) -> None:
+    """Runs are killed every second, the driver twice; the same command ends with the same losses and scores."""
+    config, rng = write_search(tmp_path), random.Random(0)
+    for kill_driver_after in (8, 16, None):
+        process = start("search", config, "--workers", 2, folder=tmp_path)
+        started = time.monotonic()
+        while process.poll() is None:
+            time.sleep(3.0)
+            if kill_driver_after is not None and time.monotonic() - started > kill_driver_after:
+                left = runs_of_driver(process.pid)
+                process.kill()
+                process.communicate()
+                time.sleep(1)
+                assert not [pid for pid in left if Path(f"/proc/{pid}").exists()], "runs outlive their driver"
+                break
+            if (pids := runs_of_driver(process.pid)) and rng.random() < 0.5:
+                os.kill(rng.choice(pids), signal.SIGKILL)
+        else:
+            assert process.returncode == 0, process.communicate()[0]
+    assert slots(tmp_path) == undisturbed
+
+
+def test_postgresql_restarts_in_the_middle(tmp_path: Path, undisturbed: Slots, postgres: Postgres) -> None:
+    url = postgres.create("restarted")
+    process = start("search", write_search(tmp_path), "--workers", 2, "--storage", url, folder=tmp_path)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "runs/small/candidates/generation-1/slot-001").exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.2)
+    postgres.restart(crash=True, seconds=3)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert "s3cret" not in output
+    assert slots(None, url) == undisturbed
 
 
 @pytest.fixture
-def config(tmp_path: Path) -> Path:
-    (tmp_path / "hyperparameters.yml").write_text(HYPERPARAMETERS)
-    path = tmp_path / "small.yml"
-    path.write_text(SEARCH)
-    return path
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Two Ray nodes on this machine."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
+    node = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_dashboard": False}
+    cluster = Cluster(initialize_head=True, head_node_args=node)
+    cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
+    yield cluster
+    cluster.shutdown()
 
 
-def trials(folder: Path, study: str = "small") -> list[optuna.trial.FrozenTrial]:
-    storage = open_storage(folder / "runs/small", create=False)
-    if study not in optuna.get_all_study_names(storage):
-        return []
-    return optuna.load_study(study_name=study, storage=storage).get_trials(deepcopy=False)
+def test_a_ray_node_is_removed(tmp_path: Path, undisturbed: Slots, cluster: Any) -> None:
+    from search.execution.ray import RayExecutor
+
+    config, folder = load_config(write_search(tmp_path)), tmp_path / "runs/small"
+    storage = open_storage(folder)
+    study, _ = open_search(config, storage)
+    removed = False
+    with RayExecutor(cluster.address) as executor:
+        for progress in Driver(study, storage, runs_of(config), executor, folder, workers=2, retries=config.retries):
+            if not removed and progress.generations[0].filled >= 1:
+                cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+                removed = True
+    assert removed
+    assert slots(tmp_path) == undisturbed
 
 
-def wait_for(folder: Path, process: subprocess.Popen[str], finished: int) -> None:
-    """Until so many candidates are complete and others are being trained."""
-    for _ in range(600):
-        time.sleep(0.1)
-        assert process.poll() is None, process.communicate()[0]
-        if (folder / "runs/small/journal.log").exists():
-            states = Counter(trial.state for trial in trials(folder))
-            if states[TrialState.COMPLETE] >= finished and states[TrialState.RUNNING]:
-                return
-    raise AssertionError("the search made no progress")
-
-
-def places(folder: Path) -> dict[tuple[int, int], tuple[AuxLoss, float | None]]:
-    """The loss and the score of every filled place; each is filled once."""
-    complete = [trial for trial in trials(folder) if trial.state == TrialState.COMPLETE]
-    filled = {(t.user_attrs["stage"], t.user_attrs["place"]): (params_to_loss(t.params), t.value) for t in complete}
-    assert len(filled) == len(complete)
-    return filled
-
-
-def workers_of(process: subprocess.Popen[str]) -> list[int]:
-    """Numbers of the worker processes (multiprocessing's own helper beside them is none)."""
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    return [int(pid) for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-
-
-def test_search_survives_kill_and_interrupt_and_ends_as_if_nothing_had_been(config: Path, tmp_path: Path) -> None:
-    undisturbed = tmp_path / "undisturbed"
-    undisturbed.mkdir()
-    aarl("search", config, "--threads", 1, folder=undisturbed)
-
-    process = start("search", config, "--workers", 2, "--threads", 1, folder=tmp_path)
-    wait_for(tmp_path, process, finished=1)
-    os.kill(workers_of(process)[0], signal.SIGKILL)  # one worker: the program starts another one
-    wait_for(tmp_path, process, finished=2)
-    os.killpg(process.pid, signal.SIGKILL)  # everything
-    process.communicate()
-
-    process = start("search", config, "--workers", 2, "--threads", 1, folder=tmp_path)
-    wait_for(tmp_path, process, finished=5)
-    os.killpg(process.pid, signal.SIGINT)  # Ctrl-C
+def test_ctrl_c_and_the_same_command(tmp_path: Path, undisturbed: Slots) -> None:
+    config = write_search(tmp_path)
+    process = start("search", config, folder=tmp_path)
+    wait_until(lambda: (tmp_path / "runs/small/candidates/generation-1/slot-001").exists(), process)
+    process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Interrupted" in output and "Traceback" not in output, output
-
-    output = aarl("search", config, "--workers", 2, "--threads", 1, folder=tmp_path)
-    assert "stage 1: 4/4 done" in output and "stage 2: 4/4 done" in output
-    assert places(tmp_path).keys() == {(stage, place) for stage in (1, 2) for place in range(4)}
-    # Losses and scores, to the bit: trainings that went on from a checkpoint are those that were not disturbed.
-    assert places(tmp_path) == places(undisturbed)
-    for trial in trials(tmp_path):
-        assert trial.state in (TrialState.COMPLETE, TrialState.FAIL)
-        if trial.state == TrialState.COMPLETE:
-            curve = trial.user_attrs["curve"]
-            assert [point[0] for point in curve] == [400, 800]
-            assert trial.intermediate_values == {point[0]: point[1] for point in curve}
-            assert trial.value == pytest.approx(sum(point[1] for point in curve) / 2)
-    # Checkpoints with their replay buffers are gone, curves are there.
-    assert not list((tmp_path / "runs").rglob("replay_buffer.pkl"))
-    assert len(list((tmp_path / "runs/small/candidates").rglob("curve.csv"))) == 8
+    assert process.returncode == 130 and "resumes" in output
+    states = [trial.state for trial in optuna.load_study(study_name="small", storage=storage(tmp_path)).trials]
+    assert TrialState.RUNNING not in states
+    # Another program may not have the search of one that runs, and other settings are refused.
+    process = start("search", config, folder=tmp_path)
+    wait_until(lambda: (tmp_path / "runs/small/candidates/generation-1/slot-002").exists(), process)
+    second = start("search", config, folder=tmp_path)
+    assert second.wait(60) == 2 and "another program" in second.communicate()[0]
+    assert process.wait(200) == 0
+    assert slots(tmp_path) == undisturbed
+    write_search(tmp_path, SEARCH.replace("population_size: 4", "population_size: 5"))
+    other = start("search", config, folder=tmp_path)
+    assert other.wait(60) == 2 and "population_size" in other.communicate()[0]
 
 
-def test_the_other_procedures_on_a_finished_search(config: Path, tmp_path: Path) -> None:
-    aarl("search", config, "--workers", 2, folder=tmp_path)
-
-    assert "CURL" in aarl("baselines", config, "--workers", 2, folder=tmp_path)
-    scores = {trial.user_attrs["variant"]: trial.value for trial in trials(tmp_path, "small-baselines")}
-    assert scores.keys() == {"CURL", "SAC"}
-    # They are in the plot of the search although it was over before.
-    study = optuna.load_study(study_name="small", storage=open_storage(tmp_path / "runs/small"))
-    plots = get_plotly_graph_objects(study._storage.get_study_system_attrs(study._study_id))
-    assert all(name in plots["evolution"] for name in scores)
-
-    output = aarl("cross-validate", config, "--study", "small", "--top", 2, "--workers", 2, folder=tmp_path)
-    runs = trials(tmp_path, "small-cross-validation")
-    cells = Counter((t.user_attrs["variant"], t.user_attrs["environment"], t.user_attrs["seed"]) for t in runs)
-    assert len(cells) == 2 * 2 * 2 and set(cells.values()) == {1}
-    ranked = sorted(trials(tmp_path), key=lambda trial: -trial.value)
-    assert {variant for variant, _, _ in cells} == {str(params_to_loss(t.params).canonical()) for t in ranked[:2]}
-    means = {variant: sum(t.value for t in runs if t.user_attrs["variant"] == variant) / 4 for variant, _, _ in cells}
-    winner = max(means, key=lambda variant: means[variant])
-    assert f"Winner: {winner}" in output
-    written = yaml.safe_load((tmp_path / "runs/small/winner.yml").read_text())
-    assert AuxLoss.from_dict(written["aux_loss"]) == AuxLoss.parse(winner)
-
-    out = tmp_path / "trained"
-    hyperparameters = tmp_path / "hyperparameters.yml"
-    winner_file = tmp_path / "runs/small/winner.yml"
-    aarl(
-        *("train", "cartpole-balance", "--config", hyperparameters, "--aux-loss", winner_file),
-        *("--steps", 800, "--evaluations", 1, "--episodes", 1, "--out", out),
-        folder=tmp_path,
-    )
-    assert json.loads((out / "run.json").read_text())["loss"] == winner and (out / "model.zip").exists()
-
-    aarl("report", "runs/small", "--config", config, folder=tmp_path)
-    report = (tmp_path / "runs/small/report.html").read_text()
-    assert "CURL" in report and str(params_to_loss(ranked[0].params)).replace(">", "&gt;") in report
-
-    output = aarl("select-operator", config, "--workers", 2, folder=tmp_path)
-    runs = trials(tmp_path, "small-operators")
-    assert len({trial.user_attrs["variant"] for trial in runs}) == len(runs) == 10
-    best = max(runs, key=lambda trial: trial.user_attrs["curve"][-1][1])
-    first = next(line for line in output.splitlines() if "negative samples" in line)
-    assert best.user_attrs["variant"] in first and "1.000" in first
+def storage(folder: Path) -> Any:
+    return open_storage(folder / "runs/small", create=False)
 
 
-def test_unusable_input_is_one_line(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    aarl("search", config, "--stages", 1, folder=tmp_path)
-    config.write_text(config.read_text().replace("population_size: 4", "population_size: 6"))
-    (tmp_path / "runs/other").mkdir()
-    (tmp_path / "runs/other/journal.log").touch()
-    for arguments, culprit in (
-        (("search", config), "population_size"),
-        (("cross-validate", config, "--study", "smal"), "'smal'"),
-        (("cross-validate", config, "--folder", "elsewhere"), "elsewhere"),
-        (("report", "elsewhere"), "elsewhere"),
-        (("report",), "runs/other, runs/small"),
-        (("search", tmp_path / "missing.yml"), "missing.yml"),
-        (("search", config, "--storage", "postgresql://me:secret@127.0.0.1:1/nothing"), "me:***"),
-    ):
-        result = CliRunner(env={"COLUMNS": "200"}).invoke(app, [*map(str, arguments)])
-        assert result.exit_code == 2 and culprit in result.output and "secret" not in result.output, result.output
-        assert len(result.output.strip().splitlines()) <= 2 and "Traceback" not in result.output, result.output
-    assert not (tmp_path / "elsewhere").exists()
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < deadline
+        time.sleep(0.1)

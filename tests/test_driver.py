@@ -1,0 +1,205 @@
+"""The driver: the same losses and scores however many runs are in flight, however they end, and after interruptions."""
+
+import random
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import optuna
+import pytest
+from optuna.pruners import ThresholdPruner
+from optuna.trial import TrialState
+
+from sb3_aarl import AuxLoss
+from sb3_aarl.callbacks import Evaluation, write_curve
+from search.evolution.sampler import AuxLossSampler
+from search.evolution.space import loss_of, loss_to_params, suggest_aux_loss
+from search.execution import driver
+from search.execution.driver import Driver
+from search.execution.runs import RunFailed
+from search.execution.storage import open_storage
+from search.training.run import Run
+
+CHECKPOINTS = (100, 200, 300)
+SETTINGS: dict[str, Any] = {"population_size": 6, "n_random": 5, "n_prior": 2, "max_horizon": 3, "n_generations": 3, "seed": 7}
+
+
+def returns(run: Run) -> list[float]:
+    """What a run of these tests reaches: a function of its loss and seed."""
+    rng = random.Random(f"{AuxLoss.parse(str(run.aux_loss)).canonical()} {run.seed}")
+    return [rng.uniform(0, 100) for _ in run.checkpoints]
+
+
+def make_runs(loss: AuxLoss, seeds: tuple[int, ...] = (0, 1)) -> list[Run]:
+    values: dict[str, Any] = {"environment": "Pendulum-v1", "hyperparameters": {}, "checkpoints": CHECKPOINTS}
+    return [Run(aux_loss=str(loss), seed=seed, **values) for seed in seeds]
+
+
+class Executor:
+    """Runs that a test ends when it likes, in any order."""
+
+    def __init__(self) -> None:
+        self.pending: list[tuple[Future[Any], Path]] = []
+
+    def submit(self, fn: Any, folder: str) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.pending.append((future, Path(folder)))
+        return future
+
+    def end(self, rng: random.Random, failure: str | None = None, retry: bool = False) -> None:
+        """End one run: with a complete curve, one that was stopped, or a failure."""
+        future, folder = self.pending.pop(rng.randrange(len(self.pending)))
+        run = Run.model_validate_json((folder / "run.json").read_text())
+        n = 1 if (folder / "stop").exists() else len(run.checkpoints)
+        curve = [Evaluation(*point, 0.0, 1, 1.0) for point in zip(run.checkpoints[:n], returns(run)[:n], strict=True)]
+        write_curve(folder / "curve.csv", curve)
+        future.set_result({"curve": [list(point) for point in curve], "failure": failure, "retry": retry})
+
+    def evaluate(self) -> None:
+        """All runs have their first evaluation."""
+        for _, folder in self.pending:
+            run = Run.model_validate_json((folder / "run.json").read_text())
+            write_curve(folder / "curve.csv", [Evaluation(run.checkpoints[0], returns(run)[0], 0.0, 1, 1.0)])
+
+
+@pytest.fixture(autouse=True)
+def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driver, "POLL_SECONDS", 0)
+
+
+def start(folder: Path, executor: Executor, workers: int = 1, **kwargs: Any) -> Driver:
+    """The driver of a study, as the command line makes it: a new sampler each time."""
+    storage = open_storage(folder)
+    study = optuna.create_study(
+        study_name="search",
+        storage=storage,
+        sampler=AuxLossSampler(**SETTINGS),
+        direction="maximize",
+        load_if_exists=True,
+        pruner=kwargs.pop("pruner", optuna.pruners.NopPruner()),
+    )
+    return Driver(study, storage, kwargs.pop("make_runs", make_runs), executor, folder, workers, **kwargs)
+
+
+def outcome(search: Driver) -> dict[tuple[int, int], tuple[str, float | None]]:
+    """Loss and score of every slot."""
+    return {
+        (trial.user_attrs["generation"], trial.user_attrs["slot"]): (str(loss_of(trial)), trial.value)
+        for trial in search.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED))
+    }
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], tuple[str, float | None]]:
+    """One candidate after the other, undisturbed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driver, "POLL_SECONDS", 0)
+        executor, rng = Executor(), random.Random(0)
+        search = start(tmp_path_factory.mktemp("expected"), executor)
+        for _ in search:
+            while executor.pending:
+                executor.end(rng)
+    found = outcome(search)
+    assert len(found) == 7 + 6 + 6
+    return found
+
+
+@pytest.mark.parametrize("workers", [1, 3, 8])
+def test_losses_and_scores_depend_on_nothing_but_the_seed(workers: int, tmp_path: Path, expected: Any) -> None:
+    """Runs end in any order; their processes are killed, and drivers are killed and started again."""
+    rng = random.Random(workers)
+    while True:
+        executor = Executor()  # processes end with their driver
+        search = start(tmp_path, executor, workers, retries=100)
+        for progress in search:  # noqa: B007
+            if rng.random() < 0.05:
+                break
+            if executor.pending and rng.random() < 0.7:
+                killed = rng.random() < 0.3
+                executor.end(rng, "killed" if killed else None, retry=killed)
+        else:
+            break
+    assert outcome(search) == expected
+    assert progress.best == max(score for _, score in expected.values() if score is not None)
+    assert [generation.filled for generation in progress.generations] == [7, 6, 6]
+
+
+def test_a_trial_left_running_is_interrupted_and_its_slot_has_the_same_loss(tmp_path: Path) -> None:
+    loss = suggest_aux_loss(start(tmp_path, Executor()).study.ask(), SETTINGS["max_horizon"])  # and then its driver was killed
+    search = start(tmp_path, Executor())
+    next(iter(search))
+    first, again, *_ = search.study.trials
+    assert (first.state, first.user_attrs["interrupted"]) == (TrialState.FAIL, True)
+    assert loss_of(again) == loss
+    assert [again.user_attrs[key] for key in ("generation", "slot", "attempt")] == [1, 0, 0]
+
+
+def test_a_second_driver_is_refused(tmp_path: Path) -> None:
+    running = iter(start(tmp_path, Executor()))
+    next(running)
+    with pytest.raises(ValueError, match="another program runs this search"):
+        next(iter(start(tmp_path, Executor())))
+
+
+def test_a_failed_candidate_makes_room_for_another_one(tmp_path: Path) -> None:
+    executor, rng, seen = Executor(), random.Random(0), []
+    search = start(tmp_path, executor, on_change=lambda trial: seen.append(trial.number))
+    for i, _ in enumerate(search):
+        while executor.pending:
+            executor.end(rng, "the loss is nan" if i == 0 else None)
+    failed, other, *_ = search.study.trials
+    assert (failed.state, failed.user_attrs["reason"]) == (TrialState.FAIL, "the loss is nan")
+    assert loss_of(other) != loss_of(failed)
+    assert (other.user_attrs["slot"], other.user_attrs["attempt"]) == (failed.user_attrs["slot"], 1)
+    assert set(seen) == {trial.number for trial in search.study.trials[: len(set(seen))]}
+
+
+def test_failures_without_end_end_the_search(tmp_path: Path) -> None:
+    executor, rng = Executor(), random.Random(0)
+
+    def run() -> None:
+        for _ in start(tmp_path, executor, retries=1):
+            while executor.pending:
+                executor.end(rng, "no space left on device", retry=True)
+
+    with pytest.raises(RunFailed, match="10 candidates failed one after the other, the last one: no space left"):
+        run()
+
+
+def test_reports_the_mean_over_the_seeds_and_prunes(tmp_path: Path) -> None:
+    executor, rng = Executor(), random.Random(0)
+    search = start(tmp_path, executor, workers=2, pruner=ThresholdPruner(lower=60))
+    for _ in search:
+        executor.evaluate()
+        if rng.random() < 0.5 and executor.pending:
+            executor.end(rng)
+    pruned = complete = 0
+    for trial in search.study.trials:
+        loss = loss_of(trial)
+        assert loss is not None
+        means = [sum(point) / 2 for point in zip(*map(returns, make_runs(loss)), strict=True)]
+        for step, value in trial.intermediate_values.items():
+            assert value == pytest.approx(means[CHECKPOINTS.index(step)])
+        if trial.state == TrialState.PRUNED:
+            pruned += 1
+            assert min(trial.intermediate_values.values()) < 60
+        else:
+            complete += 1
+            assert trial.value == pytest.approx(sum(means) / 3)
+            assert [point[1] for point in trial.user_attrs["curve"]] == pytest.approx(means)
+    assert pruned and complete
+
+
+def test_enqueued_losses_are_trained_and_invalid_ones_cost_nothing(tmp_path: Path) -> None:
+    executor, rng = Executor(), random.Random(0)
+    search = start(tmp_path, executor)
+    loss = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
+    search.study.enqueue_trial({**loss_to_params(loss), "source/s_t": False})
+    search.study.enqueue_trial(loss_to_params(loss))
+    for _ in search:
+        while executor.pending:
+            executor.end(rng)
+    invalid, enqueued, *_ = search.study.trials
+    assert invalid.state == TrialState.PRUNED and "curve" not in invalid.user_attrs
+    assert (loss_of(enqueued), enqueued.state) == (loss, TrialState.COMPLETE)
+    assert len(outcome(search)) == 7 + 6 + 6

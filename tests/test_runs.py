@@ -1,0 +1,159 @@
+"""Runs at executors: real processes, killed and resubmitted; a matrix; submitit's own executor."""
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny import tiny_run
+
+from sb3_aarl.callbacks import read_curve
+from search.execution.matrix import Cell, Matrix, cell_folder, comparable, failures, run_matrix, scores
+from search.execution.runs import LocalExecutor, Submission, mean_curve, start_run
+from search.training.run import is_finished, prepare_run, train
+
+pytestmark = pytest.mark.slow
+
+
+def returns(folder: Path) -> list[tuple[int, float]]:
+    return [(point.environment_steps, point.mean) for point in read_curve(folder / "curve.csv")]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, float]]:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    prepare_run(folder, tiny_run())
+    train(folder)
+    return returns(folder)
+
+
+def children() -> list[int]:
+    """Processes of runs that this one has started."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(path.read_text().rsplit(")", 1)[1].split()[1])
+            if parent == os.getpid() and b"search.training.run" in (path.parent / "cmdline").read_bytes():
+                found.append(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def wait_done(submission: Submission) -> None:
+    while not submission.done():
+        time.sleep(0.05)
+
+
+def test_a_killed_run_is_resubmitted_and_ends_alike(tmp_path: Path, undisturbed: list[Any]) -> None:
+    with LocalExecutor(1) as executor:
+        submission = Submission(executor, tmp_path, tiny_run(), retries=5)
+        kills = 0
+        while not submission.done():
+            time.sleep(0.05)
+            if kills < 2 and (pids := children()) and (kills == 0 or (tmp_path / "curve.csv").exists()):
+                os.kill(pids[0], signal.SIGKILL)
+                kills += 1
+                time.sleep(0.5)
+    assert submission.failure is None and kills == 2
+    assert [(point.environment_steps, point.mean) for point in submission.curve] == undisturbed == returns(tmp_path)
+
+
+def test_retries_run_out(tmp_path: Path) -> None:
+    with LocalExecutor(1) as executor:
+        submission = Submission(executor, tmp_path, tiny_run(imports=("no_such_module",)), retries=1)
+        wait_done(submission)
+    assert submission.failure is not None and "no_such_module" in submission.failure
+
+
+def test_a_finished_run_is_read(tmp_path: Path) -> None:
+    prepare_run(tmp_path, tiny_run())
+    curve = train(tmp_path)
+    started = time.monotonic()
+    result = start_run(str(tmp_path))
+    assert time.monotonic() - started < 0.5
+    assert result == {"curve": [list(point) for point in curve], "failure": None, "retry": False}
+
+
+def test_leaving_the_executor_ends_its_processes(tmp_path: Path) -> None:
+    with LocalExecutor(1) as executor:
+        Submission(executor, tmp_path, tiny_run(checkpoints=(50_000, 100_000)), retries=0)
+        while not children():
+            time.sleep(0.05)
+    assert not children()
+    assert not is_finished(tmp_path)
+
+
+def test_a_matrix_trains_what_is_missing_and_names_what_failed(tmp_path: Path, undisturbed: list[Any]) -> None:
+    bad = "{s_t} -> {s_t+1}"
+    runs = {
+        Cell("forward-dynamics", "Pendulum-v1", 0): tiny_run(),
+        Cell(bad, "Pendulum-v1", 0): tiny_run(aux_loss=bad, imports=("no_such_module",)),
+        Cell("none", "Pendulum-v1", 0): tiny_run(aux_loss=None),
+    }
+    matrix = Matrix("comparison", tmp_path, runs)
+    with LocalExecutor(2) as executor:
+        progress = list(run_matrix(matrix, executor, workers=2, retries=0))[-1]
+    assert progress[:3] == (3, 2, 1)
+    assert list(failures(matrix)) == [Cell(bad, "Pendulum-v1", 0)]
+    table = scores(matrix).set_index("variant")
+    assert table.loc["forward-dynamics", "last"] == undisturbed[-1][1]
+    assert table.loc["forward-dynamics", "score"] == pytest.approx(sum(mean for _, mean in undisturbed) / 2)
+    assert set(comparable(scores(matrix))["variant"]) == {"forward-dynamics", "none"}
+    # The same command again tries what failed, and repeats nothing else.
+    before = (cell_folder(tmp_path, Cell("none", "Pendulum-v1", 0)) / "curve.csv").stat().st_mtime_ns
+    mended = Matrix("comparison", tmp_path, {cell: run for cell, run in runs.items() if cell.variant != bad})
+    with LocalExecutor(1) as executor:
+        assert list(run_matrix(mended, executor))[-1][:3] == (2, 2, 0)
+    assert (cell_folder(tmp_path, Cell("none", "Pendulum-v1", 0)) / "curve.csv").stat().st_mtime_ns == before
+
+
+def test_a_matrix_refuses_folders_of_other_runs(tmp_path: Path) -> None:
+    cell = Cell("SAC", "Pendulum-v1", 0)
+    prepare_run(cell_folder(tmp_path, cell), tiny_run(aux_loss=None))
+    other = Matrix("comparison", tmp_path, {cell: tiny_run(aux_loss=None, hyperparameters={"batch_size": 9})})
+    with LocalExecutor(1) as executor, pytest.raises(ValueError, match="batch_size"):
+        list(run_matrix(other, executor))
+
+
+def test_submitit_is_an_executor(tmp_path: Path, undisturbed: list[Any]) -> None:
+    submitit = pytest.importorskip("submitit")
+    executor = submitit.LocalExecutor(folder=str(tmp_path / "submitit"))
+    executor.update_parameters(timeout_min=5)
+    submission = Submission(executor, tmp_path / "run", tiny_run(), retries=0)
+    wait_done(submission)
+    assert submission.failure is None
+    assert returns(tmp_path / "run") == undisturbed
+
+
+def test_executors_that_fail_are_retried(tmp_path: Path) -> None:
+    class Lost:
+        def done(self) -> bool:
+            return True
+
+        def result(self) -> Any:
+            raise ConnectionError("the node is gone")
+
+    class Executor:
+        calls = 0
+
+        def submit(self, fn: Any, *args: Any) -> Lost:
+            self.calls += 1
+            return Lost()
+
+    executor = Executor()
+    submission = Submission(executor, tmp_path, tiny_run(), retries=2)
+    wait_done(submission)
+    assert executor.calls == 3 and submission.failure == "ConnectionError: the node is gone"
+
+
+def test_mean_curve_is_over_all_episodes() -> None:
+    from sb3_aarl.callbacks import Evaluation
+
+    curves = [[Evaluation(10, 1.0, 2.0, 5, 0.0)], [Evaluation(10, 3.0, 0.0, 5, 0.0)]]
+    episodes = [-1.0, 3.0, 3.0, 3.0]  # two episodes of each have these means and deviations
+    assert mean_curve(curves)[0] == [10, 2.0, pytest.approx((sum((x - 2) ** 2 for x in episodes) / 4) ** 0.5)]
+    assert threading.active_count() >= 1
