@@ -1,256 +1,182 @@
-"""Checkpoints: signed with a key of the user's, read back only if they are still what was written; simulations in them."""
+"""Checkpoints: all that a run needs to be resumed exactly, as tensors and plain values in one file."""
 
-import contextlib
-import errno
-import functools
-import hashlib
-import hmac
-import io
-import json
-import logging
 import os
-import pickle
-import secrets
-import stat
-import sys
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cloudpickle  # type: ignore[import-untyped]
 import gymnasium as gym
-from gymnasium.utils import EzPickle
-from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
 
-logger = logging.getLogger(__name__)
+from sb3_aarl import SACAux
+from sb3_aarl.buffers import WindowReplayBuffer
+from sb3_aarl.callbacks import Evaluation
 
-# Names a file for the user's key, such as one that all machines of a cluster share.
-KEY_VARIABLE = "AARL_KEY_FILE"
-KEY_BYTES = 32
-MANIFEST = "manifest"
-# Of the signature's purpose, and of the manifest's form.
-PURPOSE = b"sb3-aarl checkpoint 1\n"
-# A manifest has a kilobyte.
-LARGEST_MANIFEST = 2**20
-# Code of functions is in the pickles of environments.
-PYTHON = ".".join(map(str, sys.version_info[:2]))
-DISK_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EIO, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
+CHECKPOINT = "checkpoint.pt"
+UNFINISHED = "checkpoint.tmp"
 
 
-class CheckpointError(ValueError):
-    """A checkpoint is not what this user's runs have written; the message says why in one line."""
-
-
-def is_disk_error(error: BaseException) -> bool:
-    """Whether a disk, not what was written to it, is at fault: it is full, over quota, broken or read-only."""
-    return isinstance(error, OSError) and error.errno in DISK_ERRORS
-
-
-def key_path() -> Path:
+class TruncateAt(gym.Wrapper):
     """
-    The file of the user's key: what the environment variable ``AARL_KEY_FILE`` names, else ``sb3-aarl/key`` in
-    ``$XDG_STATE_HOME`` or ``~/.local/state``.
+    Truncate the episode after given steps: a checkpoint there needs no state of the environment.
 
-    Machines that share checkpoints have to share the key.
+    :param env: The environment, without ``Monitor``
+    :param steps: Steps of this environment, counted from its first one on
     """
-    if os.environ.get(KEY_VARIABLE):
-        return Path(os.environ[KEY_VARIABLE])
-    state = os.environ.get("XDG_STATE_HOME", "")
-    return Path(state if os.path.isabs(state) else "~/.local/state") / "sb3-aarl" / "key"
+
+    def __init__(self, env: gym.Env, steps: Collection[int]):
+        super().__init__(env)
+        self._steps = frozenset(steps)
+        self._n_steps = 0
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._n_steps += 1
+        return observation, reward, terminated, truncated or self._n_steps in self._steps, info
 
 
-def user_key() -> bytes | None:
+def restart_seed(seed: int, num_timesteps: int) -> int:
     """
-    The user's secret key, made when it is first asked for.
+    The seed of what follows a checkpoint; environment i takes the i-th after it.
 
-    :return: 32 random bytes. None, with one warning in each process, where the file can be neither read nor made, or others
-        could read it: no checkpoints are kept then, trainings that are killed begin anew, and those that have one already are
-        refused
+    :param seed: Seed of the run
+    :param num_timesteps: Agent steps at the checkpoint
+    :return: A number from 2**31 on; evaluations and the beginnings of runs have those below
     """
-    return _key(key_path())
+    return 2**31 + int(np.random.SeedSequence((seed, num_timesteps)).generate_state(1)[0]) // 4
 
 
-@functools.cache
-def _key(path: Path) -> bytes | None:
-    try:
-        file = path.expanduser()
-        if not file.exists():
-            _make_key(file)
-        return _read_key(file)
-    except (OSError, RuntimeError, CheckpointError) as error:  # RuntimeError: a user without a home
-        logger.warning(
-            "No checkpoints are kept, trainings that are killed will begin anew: no key in %s (%s). %s may name another file",
-            path,
-            error,
-            KEY_VARIABLE,
-        )
-        return None
-
-
-def _make_key(path: Path) -> None:
-    """In one step: of several processes one makes it, and none sees a part of it."""
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    descriptor, unfinished = tempfile.mkstemp(dir=path.parent)  # which nobody else may read
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(secrets.token_bytes(KEY_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-        with contextlib.suppress(FileExistsError):
-            os.link(unfinished, path)
-    finally:
-        os.unlink(unfinished)
-
-
-def _read_key(path: Path) -> bytes:
-    with path.open("rb") as file:
-        status = os.fstat(file.fileno())
-        if os.name == "posix" and (status.st_uid != os.geteuid() or status.st_mode & 0o077):
-            raise CheckpointError("others may read or write it: it has to be yours, with mode 0600")
-        key = file.read(KEY_BYTES + 1)
-    if len(key) != KEY_BYTES:
-        raise CheckpointError(f"it has not the {KEY_BYTES} bytes of a key")
-    return key
-
-
-def seal(folder: Path, key: bytes, about: Mapping[str, Any]) -> None:
+def restart(model: SACAux, seed: int) -> None:
     """
-    Sign the files of a folder, and see to it that they are on the disk.
+    Begin all episodes and random sequences anew, in an undisturbed run as in a resumed one.
 
-    :param folder: Has plain files only
-    :param key: The user's key
-    :param about: Told to who opens it; plain values
+    :param model: The model, before the first action of a rollout
+    :param seed: Seed of the run
     """
-    digests = {}
-    for path in sorted(folder.iterdir()):
-        with path.open("rb+") as file:
-            os.fsync(file.fileno())
-            digests[path.name] = [path.stat().st_size, _digest(file)]
-    content = json.dumps({"about": dict(about), "files": digests, "python": PYTHON}).encode()
-    with (folder / MANIFEST).open("wb") as file:
-        file.write(_signature(key, content) + b"\n" + content)
+    env = model.get_env()
+    assert env is not None
+    # Python's, NumPy's and PyTorch's generators, the action space, and the environments at their next reset.
+    model.set_random_seed(restart_seed(seed, model.num_timesteps))
+    model._last_obs = env.reset()  # type: ignore[assignment]
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        model._last_original_obs = normalization.get_original_obs()
+    if model.action_noise is not None:
+        model.action_noise.reset()
+    if model.use_sde:  # SB3 has drawn this rollout's noise before
+        model.actor.reset_noise(env.num_envs)
+
+
+def save(folder: Path, model: SACAux, curve: Sequence[Evaluation]) -> None:
+    """
+    Replace the checkpoint of a run, in one step.
+
+    :param folder: Folder of the run
+    :param model: The model, at the end of all episodes
+    :param curve: Learning curve so far
+    """
+    assert isinstance(model.replay_buffer, WindowReplayBuffer)
+    state = {
+        "model": model.training_state(),
+        "replay_buffer": model.replay_buffer.training_state(),
+        "normalization": _normalization_state(model.get_vec_normalize_env()),
+        "curve": [list(evaluation) for evaluation in curve],
+    }
+    with (folder / UNFINISHED).open("wb") as file:
+        th.save(state, file)
         file.flush()
         os.fsync(file.fileno())
-    sync_folder(folder)
+    (folder / UNFINISHED).replace(folder / CHECKPOINT)
 
 
-@contextlib.contextmanager
-def opened(folder: Path, key: bytes | None) -> Iterator[tuple[dict[str, io.BufferedReader], dict[str, Any]]]:
+def read(folder: Path) -> dict[str, Any] | None:
     """
-    The files of a sealed folder. None is given out before all are found to be as they were.
+    The checkpoint of a run, None if there is none.
 
-    What is done to the folder later, short of writing into the very files that are open, does not change what is read.
-
-    :param folder: The folder
-    :param key: The user's key, None if there is none
-    :return: The open files by name, and what ``seal`` was told
-    :raises CheckpointError: when it is torn, altered, another user's or another Python's
-    :raises OSError: when the disk cannot be read
+    :param folder: Folder of the run
     """
-    if key is None:
-        raise CheckpointError("there is no key to check it with")
-    with contextlib.ExitStack() as stack:
-        manifest = _read_manifest(stack.enter_context(_open(folder / MANIFEST)), key)
-        if manifest["python"] != PYTHON:
-            raise CheckpointError(f"Python {manifest['python']} has written it, this is {PYTHON}")
-        files = {name: stack.enter_context(_open(folder / name)) for name in manifest["files"]}
-        for name, (size, digest) in manifest["files"].items():
-            if os.fstat(files[name].fileno()).st_size != size or _digest(files[name]) != digest:
-                raise CheckpointError(f"{name} is not what was written")
-            files[name].seek(0)
-        yield files, manifest["about"]
-
-
-def _read_manifest(file: io.BufferedReader, key: bytes) -> dict[str, Any]:
-    """Nothing of it is read before its signature is."""
-    signature, _, content = file.read(LARGEST_MANIFEST).partition(b"\n")
-    if not hmac.compare_digest(signature, _signature(key, content)):
-        raise CheckpointError(f"its {MANIFEST} is torn, or not signed with this user's key ({key_path()})")
-    return json.loads(content)
-
-
-def _signature(key: bytes, content: bytes) -> bytes:
-    return hmac.digest(key, PURPOSE + content, "sha256").hex().encode()
-
-
-def _digest(file: io.BufferedIOBase) -> str:
-    digest = hashlib.sha256()
-    while block := file.read(2**20):
-        digest.update(block)
-    return digest.hexdigest()
-
-
-def _open(path: Path) -> io.BufferedReader:
-    """A plain file: no link, no folder, and no pipe, which would be waited for."""
-    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    try:
-        descriptor = os.open(path, flags)
-    except OSError as error:
-        # What else there is, such as a server that does not answer, says nothing of the checkpoint.
-        if isinstance(error, FileNotFoundError | NotADirectoryError | IsADirectoryError | PermissionError):
-            raise CheckpointError(f"{path.name} cannot be read: {error.strerror}") from None
-        if error.errno in (errno.ELOOP, errno.ENXIO):
-            raise CheckpointError(f"{path.name} is no plain file") from None
-        raise
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise CheckpointError(f"{path.name} is no plain file")
-    return os.fdopen(descriptor, "rb")
-
-
-def sync_folder(folder: Path) -> None:
-    """See to it that names in a folder are on the disk."""
-    if os.name == "posix":
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-class _NotSavedError(Exception):
-    """The state of a simulation cannot be saved."""
-
-
-class _Pickler(cloudpickle.Pickler):
-    """Refuses what would be pickled without its state."""
-
-    def persistent_id(self, obj: Any) -> None:
-        loses_state = isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__
-        # The argument of shimmy's constructor is the simulation, which is pickled whole.
-        if loses_state and type(obj) is not DmControlCompatibilityV0:
-            raise _NotSavedError(f"{type(obj).__name__} pickles the arguments of its constructor only (EzPickle)")
-
-
-class ResumableEnv(gym.Wrapper):
-    """
-    An environment whose state can be saved in the middle of an episode, and put back into another one of its kind.
-
-    :param env: The environment, ``Monitor`` included. What it pickles has to be all of its state
-    """
-
-    def dump_state(self) -> bytes | str:
-        """All of its state; or why it cannot be saved, in one line."""
-        buffer = io.BytesIO()
-        try:
-            _Pickler(buffer).dump(self.env)
-        except Exception as error:  # whatever an environment's own pickling raises
-            reason = str(error) if isinstance(error, _NotSavedError) else f"{type(error).__name__}: {error}"
-            return " ".join(reason.split())
-        return buffer.getvalue()
-
-    def load_state(self, state: bytes) -> str | None:
-        """
-        Go on from a state.
-
-        :param state: What ``dump_state`` gave. It is unpickled: it has to be the user's own
-        :return: Why it cannot be, in one line; None if it can
-        """
-        try:
-            env = pickle.loads(state)
-        except Exception as error:  # such as the simulator's, which is of another version
-            return " ".join(f"{type(error).__name__}: {error}".split())
-        self.env.close()
-        self.env = env
+    if not (folder / CHECKPOINT).exists():
         return None
+    # Mapped into memory, so that the replay buffer is not there twice.
+    return th.load(folder / CHECKPOINT, map_location="cpu", weights_only=True, mmap=True)
+
+
+def load(model: SACAux, state: Mapping[str, Any]) -> None:
+    """
+    Put a checkpoint into a new model and its environment.
+
+    :param model: The model, with the same settings
+    :param state: As returned by :func:`read`
+    """
+    env = model.get_env()
+    assert env is not None and isinstance(model.replay_buffer, WindowReplayBuffer)
+    model.load_training_state(state["model"])
+    model.replay_buffer.load_training_state(state["replay_buffer"])
+    # VecNormalize learns from every reset, so learn() must not reset: these observations are never used.
+    model._last_obs = env.reset()  # type: ignore[assignment]
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        model._last_original_obs = normalization.get_original_obs()
+        for name, values in state["normalization"].items():
+            statistics = getattr(normalization, name)
+            statistics.mean, statistics.var = values["mean"].numpy(), values["var"].numpy()
+            statistics.count = values["count"]
+
+
+def _normalization_state(env: VecNormalize | None) -> dict[str, Any]:
+    state = {}
+    for name in ("obs_rms", "ret_rms"):
+        if hasattr(env, name):
+            statistics = getattr(env, name)
+            mean, var = (th.as_tensor(np.array(value)) for value in (statistics.mean, statistics.var))
+            state[name] = {"mean": mean, "var": var, "count": float(statistics.count)}
+    return state
+
+
+def remove(folder: Path) -> None:
+    """
+    Replay buffers are large.
+
+    :param folder: Folder of the run
+    """
+    for name in (CHECKPOINT, UNFINISHED):
+        (folder / name).unlink(missing_ok=True)
+
+
+class CheckpointCallback(BaseCallback):
+    """
+    After each evaluation, save the run when the rollout that was evaluated is stored and trained on, and restart it.
+
+    :param folder: Folder of the run
+    :param seed: Seed of the run
+    :param curve: The learning curve, which ``LearningCurveCallback`` appends to
+    :param on_save: Called after each checkpoint; training ends if it returns False
+    """
+
+    model: SACAux
+
+    def __init__(self, folder: Path, seed: int, curve: list[Evaluation], on_save: Callable[[], bool]):
+        super().__init__()
+        self.folder = folder
+        self.seed = seed
+        self.curve = curve
+        self.on_save = on_save
+        self.stopped = False
+        self._n_saved = len(curve)
+        self._restart = bool(curve)  # of a resumed run
+
+    def _on_rollout_start(self) -> None:
+        if len(self.curve) > self._n_saved:
+            save(self.folder, self.model, self.curve)
+            self._n_saved = len(self.curve)
+            self.stopped = not self.on_save()
+            self._restart = True
+        if self._restart:
+            restart(self.model, self.seed)
+            self._restart = False
+
+    def _on_step(self) -> bool:
+        return not self.stopped
