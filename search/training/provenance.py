@@ -1,10 +1,12 @@
-"""Where a number comes from: commit, versions, machine and command, as plain values for JSON and notes."""
+"""Provenance of a result: commit, versions, machine and command, as plain values for JSON and notes."""
 
+import contextlib
 import functools
 import hashlib
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -16,20 +18,16 @@ from typing import Any
 import torch as th
 
 from sb3_aarl.callbacks import replace_text
-from search.execution.passwords import storage_name
 
-# Of a run, in its folder.
 ABOUT = "provenance.json"
-
 PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "shimmy", "optuna", "numpy")
 
 
 @functools.cache
 def commit() -> str:
     """
-    The commit of this checkout, with ``+changes.`` and a hash of them if files differ from it; the version where there is
-    no checkout, or an installation that lies in somebody else's. It is looked up once: a process keeps the code that it has
-    begun with, whatever is checked out later.
+    The commit of this checkout, with ``+changes.`` and a hash of them where files differ from it; the version where there is
+    no checkout. It is looked up once: a process keeps the code that it started with, whatever is checked out later.
     """
     root = Path(__file__).parents[2]
 
@@ -37,7 +35,7 @@ def commit() -> str:
         return subprocess.run(["git", *arguments], cwd=root, capture_output=True, check=True).stdout.strip()
 
     try:
-        if not root.samefile(os.fsdecode(git("rev-parse", "--show-toplevel"))):
+        if not root.samefile(os.fsdecode(git("rev-parse", "--show-toplevel"))):  # installed inside another checkout
             return metadata.version("sb3-aarl")
         changes = git("diff", "--no-ext-diff", "HEAD")
         digest = f"+changes.{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
@@ -59,24 +57,21 @@ def cpu() -> str:
 
 @functools.cache
 def versions() -> str:
-    """The packages that a figure depends on, those that are there."""
+    """Versions of the installed packages that results depend on."""
     found = []
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(metadata.PackageNotFoundError):
             found.append(f"{package} {metadata.version(package)}")
-        except metadata.PackageNotFoundError:
-            continue
     return ", ".join(found)
 
 
 def provenance() -> dict[str, str]:
-    """What has to stand beside every figure: commit, command, date, hardware, versions."""
+    """Commit, command, date, hardware and versions: they belong beside every result."""
     name = Path(sys.argv[0]).name
-    program = "aarl" if name == "main.py" else name  # that is python -m search.cli.main
+    command = " ".join(["aarl" if name == "main.py" else name, *sys.argv[1:]])  # main.py: python -m search.cli.main
     return {
         "commit": commit(),
-        # It stands in notes and reports, which others read.
-        "command": " ".join(storage_name(argument) for argument in [program, *sys.argv[1:]]),
+        "command": re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", command),  # passwords in URLs
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "cpu": cpu(),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else "none",
@@ -87,30 +82,40 @@ def provenance() -> dict[str, str]:
 
 def read_about(path: Path) -> dict[str, Any]:
     """
-    What stands in a run's folder; nothing if it is not there, or torn.
+    The ``provenance.json`` of a run, empty if there is none.
 
-    :param path: The folder
+    :param path: Folder of the run
     """
-    try:
-        about = json.loads((path / ABOUT).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
-        return {}
-    return about if isinstance(about, dict) else {}
+    file = path / ABOUT
+    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
 
 
 def write_about(path: Path, about: Mapping[str, Any]) -> None:
     """
-    Leave in a run's folder how it is trained.
+    Write the ``provenance.json`` of a run, in one step.
 
-    :param path: The folder
+    :param path: Folder of the run
     :param about: Plain values
     """
     replace_text(path / ABOUT, json.dumps(about, indent=1) + "\n")
 
 
+def add_session(path: Path, about: Mapping[str, Any], **session: Any) -> None:
+    """
+    Add a session, in which a run was started or resumed, to its ``provenance.json``.
+
+    :param path: Folder of the run
+    :param about: Values of the run; those that are there already stay
+    :param session: Values of the session, beside :func:`provenance`
+    """
+    before = read_about(path)
+    sessions = [*before.get("sessions", ()), {**provenance(), **session}]
+    write_about(path, {**about, **before, "sessions": sessions})
+
+
 def save_result(path: Path, **result: Any) -> None:
     """
-    Write a figure as JSON, with :func:`provenance` beside it.
+    Write a result as JSON, with :func:`provenance` beside it.
 
     :param path: File
     :param result: What was measured, plain values

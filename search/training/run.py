@@ -179,7 +179,9 @@ def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int
     :raises ValueError: when there are too few steps for so many checkpoints
     """
     if n_evaluations < 1 or environment_steps < n_evaluations * interval:
-        raise ValueError(f"{environment_steps} environment steps, {interval} at a time, are too few for {n_evaluations} evaluations")
+        raise ValueError(
+            f"{environment_steps} environment steps, {interval} at a time, are too few for {n_evaluations} evaluations"
+        )
     every = environment_steps // n_evaluations // interval * interval
     return tuple(every * (i + 1) for i in range(n_evaluations))
 
