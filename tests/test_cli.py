@@ -30,7 +30,7 @@ from search.execution.matrix import MAX_TRIES, Cell, Grid
 from search.execution.storage import open_storage
 from search.studies.cross_validation import make_grid
 from search.training import run as training
-from search.training.config import load_config
+from search.studies.config import load_config
 from search.training.provenance import read_about, write_about
 
 ROOT = Path(__file__).parent.parent

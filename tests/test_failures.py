@@ -30,7 +30,7 @@ from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import loss_to_params
 from search.execution.storage import open_storage
 from search.studies.objective import CandidateFailed, DiskError, Objective, check_study, disk_problem, memory_problem
-from search.training.config import load_config
+from search.studies.config import load_config
 from search.training.run import TrainingError
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")

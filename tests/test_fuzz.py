@@ -12,7 +12,8 @@ import pytest
 import yaml
 
 from sb3_aarl import AuxLoss
-from search.training.config import ConfigError, load_aux_loss, load_config, load_hyperparameters
+from search.studies.config import load_config
+from search.training.config import ConfigError, load_aux_loss, load_hyperparameters
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 

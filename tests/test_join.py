@@ -18,7 +18,7 @@ from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import params_to_loss, suggest_aux_loss
 from search.execution import driver as evolve
 from search.execution import workers
-from search.training.config import Baseline, SearchConfig, load_config
+from search.studies.config import Baseline, SearchConfig, load_config
 
 CONFIGS = sorted((Path(__file__).parent.parent / "zoo_configs" / "search").glob("*.yml"))
 TINY = """\

@@ -36,7 +36,8 @@ from search.execution.local import Unfit, WorkerError
 from search.execution.storage import open_storage
 from search.studies.objective import CandidateFailed, DiskError, Objective, disk_problem, make_pruner, mean_curve
 from search.training import run as training
-from search.training.config import ConfigError, load_config
+from search.studies.config import load_config
+from search.training.config import ConfigError
 from search.training.run import TrainingError, spread_checkpoints, train_candidate
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
