@@ -1,0 +1,74 @@
+"""The program ``aarl``. What the commands do lies elsewhere; imports that take seconds are made when they are needed."""
+
+import signal
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from search.cli import figures, matrices, results, search, train
+from search.cli.console import errors
+
+# Training alone does without these modules; the extra that has them.
+EXTRAS = {"psycopg": "postgres", "ray": "ray"}
+OF_SEARCH = ("filelock", "matplotlib", "optuna", "optuna_dashboard", "pandas", "plotly", "sklearn", "sqlalchemy", "tenacity")
+
+
+class Program(TyperGroup):
+    """Ends with one line and a code: 2 for input that cannot be used, 1 for runs that failed, 130 for an interruption."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            errors.print("Interrupted. The same command resumes it.")
+            raise typer.Exit(130) from None
+        except Exception as error:
+            line = explain(error)
+            if line is None:
+                raise
+            errors.print(f"Error: {line}", style="red", markup=False, highlight=False)
+            raise typer.Exit(1 if isinstance(error, (FloatingPointError, RuntimeError)) else 2) from None
+
+
+def explain(error: Exception) -> str | None:
+    """One line, without passwords, about an error that a user can fix; None for another one."""
+    kinds: list[type[Exception]] = [ValueError, OSError, FloatingPointError]
+    line = " ".join(str(error).split())
+    if isinstance(error, ModuleNotFoundError):
+        module = (error.name or "").partition(".")[0]
+        extra = "search" if module in OF_SEARCH else EXTRAS.get(module)
+        return extra and f"{line}: pip install 'sb3-aarl[{extra}]'"
+    if "search.execution.storage" in sys.modules:
+        from optuna.exceptions import StorageInternalError
+        from sqlalchemy.exc import SQLAlchemyError
+
+        from search.execution.runs import RunFailed
+        from search.execution.storage import hide_password
+
+        kinds += [RunFailed, StorageInternalError, SQLAlchemyError]
+        line = hide_password(line)
+    # A closed pipe, as of `| head`, is Typer's.
+    return line if isinstance(error, tuple(kinds)) and not isinstance(error, BrokenPipeError) else None
+
+
+app = typer.Typer(cls=Program, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+for group in (train, search, matrices, results):
+    app.add_typer(group.app)
+app.add_typer(figures.app, name="figures")
+
+
+@app.callback()
+def program() -> None:
+    """Auxiliary losses for reinforcement learning: train with one, search for better ones."""
+
+
+def main() -> None:
+    """Run the program. SIGTERM, with which clusters announce the end of a job, is an interruption like Ctrl-C."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""Commands that train a matrix of runs and show its tables: baselines, cross-validation, operator selection, benchmark."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from search.cli.console import console, errors, live, say, show_table, time_to_go
+from search.cli.options import Folder, SearchFile, Storage, Threads, Workers, read_config, run_folder
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from search.execution.matrix import Matrix
+
+
+app = typer.Typer()
+
+
+def train_matrix(matrix: "Matrix", workers: int, retries: int = 3) -> None:
+    """Train the runs of a matrix that are not finished, with a progress bar."""
+    from search.execution.matrix import run_matrix
+    from search.execution.runs import LocalExecutor
+
+    bar = Progress(
+        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rest]}")),
+        console=console,
+        auto_refresh=False,
+    )
+    task = bar.add_task(matrix.name, total=len(matrix.runs), rest="")
+    with LocalExecutor(workers) as executor, live() as show:
+        for progress in run_matrix(matrix, executor, workers, retries):
+            rest = f"{progress.failed} failed, {time_to_go(progress.seconds_to_go)}"
+            bar.update(task, completed=progress.finished, rest=rest)
+            show(bar if console.is_terminal else f"{matrix.name}: {progress.finished}/{progress.total} runs, {rest}")
+
+
+def compare(matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str) -> "pd.DataFrame | None":
+    """Show a table of the variants that can be compared, and return it; show the scores of the others beside it."""
+    from search.execution.matrix import comparable, scores
+    from search.studies.cross_validation import ranking
+
+    runs = scores(matrix)
+    compared = comparable(runs)
+    others = runs.drop(compared.index)
+    ranked = None if compared.empty else table(compared)
+    if ranked is not None:
+        show_table(texts(ranked), title)
+    if not others.empty:
+        show_table(texts(ranking(others)), "Not ranked, because runs are missing: AULC of those that are finished")
+    return ranked
+
+
+def texts(frame: "pd.DataFrame") -> "pd.DataFrame":
+    """A table of numbers as it is shown, with the short names of DeepMind Control's tasks."""
+    from search.execution.matrix import task_name
+
+    shown = frame.map("{:.3f}".format).replace("nan", "-")
+    if "runs" in frame:
+        shown["runs"] = frame["runs"].map(str)
+    return shown.rename(columns=task_name).reset_index()
+
+
+def exit_if_failed(matrix: "Matrix") -> None:
+    """Name the runs that failed, in one line each; exit code 1 if there are any."""
+    from search.execution.matrix import failures
+
+    found = failures(matrix)
+    for cell, reason in found.items():
+        line = f"Failed: {cell.variant} on {cell.environment}, seed {cell.seed}: {reason}"
+        errors.print(line, style="red", markup=False, highlight=False)
+    if found:
+        raise typer.Exit(1)
+
+
+@app.command()
+def baselines(config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None) -> None:
+    """Train the baselines of a search, which its candidates are compared with."""
+    from search.studies import search
+    from search.studies.cross_validation import ranking
+
+    settings = read_config(config, threads=threads)
+    if not settings.baselines:
+        raise ValueError(f"{config} names no baselines")
+    matrix = search.baselines(settings, run_folder(config, folder))
+    train_matrix(matrix, workers, settings.retries)
+    compare(matrix, ranking, "Baselines, AULC")
+    exit_if_failed(matrix)
+
+
+@app.command()
+def select_operator(config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None) -> None:
+    """Compare the ten operators on forward dynamics, as in the paper's table 2."""
+    from search.studies import operator_selection
+
+    settings = read_config(config, threads=threads)
+    matrix = operator_selection.make_matrix(settings, run_folder(config, folder))
+    train_matrix(matrix, workers, settings.retries)
+    compare(matrix, operator_selection.table, "Normalized returns at the last checkpoint (paper, table 2)")
+    exit_if_failed(matrix)
+
+
+@app.command()
+def cross_validate(
+    config: SearchFile,
+    study: Annotated[str | None, typer.Option(help="Study of the search. Default: the configuration file's name.")] = None,
+    top: Annotated[int | None, typer.Option(help="How many candidates. Default: the file's.", min=1)] = None,
+    storage: Storage = None,
+    workers: Workers = 1,
+    threads: Threads = None,
+    folder: Folder = None,
+) -> None:
+    """Train the best candidates of a search on several environments, and write the winner as YAML."""
+    from search.execution.storage import load_study, open_storage
+    from search.studies import cross_validation
+
+    settings = read_config(config, threads=threads)
+    path = run_folder(config, folder)
+    searched = load_study(open_storage(path, storage, create=False), study or settings.name)
+    matrix = cross_validation.make_matrix(settings, searched, path, top)
+    train_matrix(matrix, workers, settings.retries)
+    table = compare(matrix, cross_validation.ranking, "Cross-validation, AULC")
+    if table is not None:
+        winner = cross_validation.write_winner(table, path / "winner.yml")
+        say(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}")
+    exit_if_failed(matrix)
+
+
+@app.command()
+def benchmark(
+    configs: Annotated[
+        list[Path], typer.Argument(help="Files of hyper-parameters, one for each variant, such as zoo_configs/aarl_state.yml.")
+    ],
+    envs: Annotated[
+        str | None, typer.Option(help="Such as cheetah-run,Pendulum-v1. Default: those that all files have an entry for.")
+    ] = None,
+    seeds: Annotated[str, typer.Option(help="Such as 0-9 or 0,3.")] = "0-9",
+    checkpoints: Annotated[
+        str | None,
+        typer.Option(
+            help="Environment steps to compare at; the last ends the run.",
+            show_default="100k,500k,1000k as far as the files' n_timesteps",
+        ),
+    ] = None,
+    every: Annotated[
+        str | None, typer.Option(help="Evaluate, and save a checkpoint, after so many environment steps too, such as 20k.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.", min=1)] = 10,
+    workers: Workers = 1,
+    threads: Annotated[int, typer.Option(help="Threads of each run.", min=1)] = 1,
+    folder: Annotated[
+        Path, typer.Option(help="Folder of the benchmark; more variants, tasks and seeds may be added to it.")
+    ] = Path("runs/benchmark"),
+) -> None:
+    """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command resumes it."""
+    from search.cli.results import show_benchmark
+    from search.studies.benchmark import load_benchmark, parse_seeds, parse_steps
+
+    names = [name.strip() for name in envs.split(",")] if envs else []
+    steps = parse_steps(checkpoints) if checkpoints else ()
+    between = parse_steps(every) if every else (None,)
+    if len(between) != 1:
+        raise ValueError(f"--every is one number of environment steps, not {every}")
+    matrix = load_benchmark(configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder)
+    train_matrix(matrix, workers)
+    show_benchmark(folder)
+    exit_if_failed(matrix)

@@ -1,0 +1,137 @@
+"""The command ``aarl search``: it wires configuration, storage, sampler, executor, driver and notes."""
+
+import time
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.table import Table
+
+from search.cli.console import console, live, say, time_to_go
+from search.cli.options import Folder, SearchFile, Storage, Threads, read_config, run_folder
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+
+    from search.execution.driver import SearchProgress
+    from search.studies.config import SearchConfig
+
+app = typer.Typer()
+# Seconds between two drawings of the evolution, which holds every candidate.
+PLOT_SECONDS = 60.0
+
+
+@app.command()
+def search(
+    config: SearchFile,
+    storage: Storage = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(help="Runs at the same time.", show_default="1; with Ray those of a whole generation", min=1),
+    ] = None,
+    threads: Threads = None,
+    generations: Annotated[int | None, typer.Option(help="Number of generations. Default: the file's.", min=1)] = None,
+    pruner: Annotated[
+        Literal["none", "median", "hyperband"] | None, typer.Option(help="Optuna's pruner. Default: the file's.")
+    ] = None,
+    folder: Folder = None,
+    executor: Annotated[
+        Literal["local", "ray"], typer.Option(help="Where runs are executed: on this machine, or on Ray.")
+    ] = "local",
+    ray_address: Annotated[
+        str | None, typer.Option(help="A running Ray cluster: auto, or host:port. Default: a Ray of its own on this machine.")
+    ] = None,
+    cpus_per_run: Annotated[float | None, typer.Option(help="With Ray: cores of each run.", min=0, show_default="1")] = None,
+    gpus_per_run: Annotated[
+        float | None, typer.Option(help="With Ray: GPUs of each run, such as 0.25.", min=0, show_default="0")
+    ] = None,
+) -> None:
+    """Search for losses by evolution. Ctrl-C stops it, the same command resumes it."""
+    of_ray = {"ray-address": ray_address, "cpus-per-run": cpus_per_run, "gpus-per-run": gpus_per_run}
+    if executor == "local" and (named := [name for name, value in of_ray.items() if value is not None]):
+        raise ValueError(f"--{named[0]} needs --executor ray")
+
+    from search.execution.driver import Driver
+    from search.execution.runs import LocalExecutor
+    from search.execution.storage import hide_password, open_storage
+    from search.studies.search import open_search, runs_of
+
+    settings = read_config(config, threads=threads, generations=generations, pruner=pruner)
+    path = run_folder(config, folder)
+    opened = open_storage(path, storage)
+    study, _ = open_search(settings, opened)
+    option = "" if storage is None else f" --storage {hide_password(storage)}"
+    say(f"Study {settings.name}. To watch it: aarl dashboard {path}{option}")
+    running: Any
+    if executor == "ray":
+        from search.execution.ray import RayExecutor
+
+        workers = workers or settings.population_size * len(settings.seeds)
+        running = RayExecutor(ray_address, 1 if cpus_per_run is None else cpus_per_run, gpus_per_run or 0)
+    else:
+        workers = workers or 1
+        running = LocalExecutor(workers)
+    annotate = annotations(study, settings, path)
+    progresses: Any = iter(
+        Driver(study, opened, runs_of(settings), running, path, workers, settings.retries, on_change=annotate)
+    )
+    with running, closing(progresses):
+        shown = show_progress(progresses)
+    if shown is not None and shown.best is not None:
+        say(f"Best: {shown.best_loss}, score {shown.best:.2f}")
+
+
+def annotations(study: "Study", config: "SearchConfig", folder: Path) -> "Callable[[Trial], None]":
+    """Write the note of a study; the function that is returned keeps the notes of its trials and its plot up to date."""
+    from search.results.dashboard import annotate_study, annotate_trial, artifacts, update_plots
+    from search.studies.search import baseline_scores, settings
+    from search.training.provenance import provenance
+
+    annotate_study(study, settings(config), provenance())
+    pictures = artifacts(folder)
+    drawn = -PLOT_SECONDS
+
+    def annotate(trial: "Trial") -> None:
+        nonlocal drawn
+        annotate_trial(study, trial.number, pictures)
+        if time.monotonic() - drawn > PLOT_SECONDS:
+            drawn = time.monotonic()
+            update_plots(study, baseline_scores(config, folder))
+
+    return annotate
+
+
+def show_progress(progresses: "Iterable[SearchProgress]") -> "SearchProgress | None":
+    """Show the progress of a search until it ends, and return the last one."""
+    shown = None
+    with live() as show:
+        for shown in progresses:
+            show(progress_table(shown) if console.is_terminal else progress_line(shown))
+    return shown
+
+
+def progress_table(progress: "SearchProgress") -> Table:
+    """Progress for a terminal."""
+    table = Table("generation", "slots", "done", "running", "failed", title=summary(progress))
+    for column in table.columns:
+        column.justify = "right"
+    for row in progress.generations:
+        table.add_row(*map(str, (row.generation, row.slots, row.filled, row.running, row.failed)))
+    return table
+
+
+def progress_line(progress: "SearchProgress") -> str:
+    """Progress as one line."""
+    rows = [
+        f"generation {row.generation}: {row.filled}/{row.slots} done, {row.running} running, {row.failed} failed"
+        for row in progress.generations
+    ]
+    return "; ".join([*rows, summary(progress)])
+
+
+def summary(progress: "SearchProgress") -> str:
+    """The best score so far and the time to go."""
+    best = "-" if progress.best is None else f"{progress.best:.2f}"
+    return f"best {best}, {time_to_go(progress.seconds_to_go)}"
