@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
+from optuna.trial import FrozenTrial
 
 from sb3_aarl.aux_loss import LONGEST_HORIZON, OPERATORS, AuxLoss, Token
 
@@ -95,6 +96,18 @@ def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
     horizon = params["horizon"]
     source, target = (tuple(params[name] for name in names) for names in token_names(horizon))
     return AuxLoss(int(horizon), source, target, params.get("operator", "mse"), params.get("negatives", False))
+
+
+def loss_of(trial: FrozenTrial) -> AuxLoss | None:
+    """
+    The loss of a trial; None if it was never asked for one, or has parameters that are no valid loss.
+
+    :param trial: The trial
+    """
+    try:
+        return params_to_loss(trial.params)
+    except (KeyError, ValueError):
+        return None
 
 
 def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
