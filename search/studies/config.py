@@ -1,7 +1,7 @@
 """Configuration of a search: one YAML file, checked before anything runs."""
 
-import difflib
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,31 +14,15 @@ from pydantic import (
     PositiveInt,
     ValidationInfo,
     field_validator,
-    model_validator,
 )
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import LONGEST_HORIZON, AuxLoss
 from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import MAX_HORIZON, loss_to_params
-from search.training.config import (
-    FORBID,
-    ConfigError,
-    action_repeat,
-    check_hyperparameters,
-    import_modules,
-    load_hyperparameters,
-    merge,
-    read_yaml,
-    resolve_env_id,
-    validated,
-)
-
-# Arguments of AuxLossSampler, under the same names.
-SAMPLER_KEYS = (
-    *("population_size", "n_random", "n_prior", "parents", "replacement", "crossover", "horizon_change", "random"),
-    *("max_horizon", "operators", "allow_duplicates", "screening", "seed"),
-)
+from search.training import config as training
+from search.training.config import ConfigError
+from search.training.run import checkpoint_interval
 
 
 def _ascending(steps: tuple[int, ...]) -> tuple[int, ...]:
@@ -53,16 +37,25 @@ def _different(items: tuple[Any, ...]) -> tuple[Any, ...]:
     return items
 
 
-def _resolved(value: Any) -> AuxLoss | None:
+def _is_searched(loss: AuxLoss, settings: Mapping[str, Any]) -> bool:
+    try:
+        loss_to_params(loss, settings.get("operators"))
+    except ValueError:
+        return False
+    return loss.horizon <= settings.get("max_horizon", MAX_HORIZON)
+
+
+def _loss_or_none(value: Any) -> AuxLoss | None:
     return None if value in (None, "none") else catalog.resolve(value)
 
 
-Checkpoints = Annotated[tuple[PositiveInt, ...], Field(min_length=1), AfterValidator(_ascending)]
+Environment = Annotated[str, AfterValidator(training.resolve_env_id)]
+Environments = Annotated[tuple[Environment, ...], Field(min_length=1), AfterValidator(_different)]
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0, lt=2**32)], ...], Field(min_length=1), AfterValidator(_different)]
-Environments = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_different)]
+Checkpoints = Annotated[tuple[PositiveInt, ...], Field(min_length=1), AfterValidator(_ascending)]
 
 
-class CrossValidation(BaseModel):
+class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     """
     Cross-validation of a search's best candidates (paper, A.4).
 
@@ -72,15 +65,13 @@ class CrossValidation(BaseModel):
     :param checkpoints: Environment steps of the evaluations, for environments that differ from the search's
     """
 
-    model_config = FORBID
-
     environments: Environments
     seeds: Seeds = (0, 1, 2)
     top: PositiveInt = 5
-    checkpoints: dict[str, Checkpoints] = {}
+    checkpoints: dict[Environment, Checkpoints] = {}
 
 
-class OperatorSelection(BaseModel):
+class OperatorSelection(BaseModel, frozen=True, extra="forbid"):
     """
     Comparison of the ten operators (paper, A.1.3).
 
@@ -88,13 +79,11 @@ class OperatorSelection(BaseModel):
     :param seeds: Seeds of the runs on each
     """
 
-    model_config = FORBID
-
     environments: Environments
     seeds: Seeds = (0, 1, 2, 3, 4)
 
 
-class Baseline(BaseModel):
+class Baseline(BaseModel, frozen=True, extra="forbid"):
     """
     A run that the candidates are compared with (the lines of the paper's figures 4 and 6).
 
@@ -103,43 +92,28 @@ class Baseline(BaseModel):
     :param overrides: Merged over the hyper-parameters of the search
     """
 
-    model_config = FORBID
-
     name: str
-    aux_loss: Annotated[AuxLoss | None, PlainValidator(_resolved)] = None
+    aux_loss: Annotated[AuxLoss | None, PlainValidator(_loss_or_none)] = None
     overrides: dict[str, Any] = {}
 
 
-class SearchConfig(BaseModel):
+class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     """
-    A search. Defaults are the paper's.
+    A search. Defaults are the paper's. The arguments from ``population_size`` to ``seed`` are those of ``AuxLossSampler``.
 
     :param path: The file that it was read from
-    :param environment: Id of the environment
+    :param imports: Modules that are imported first, such as those that register environments
+    :param environment: Id of the environment, or the short form of a DeepMind Control task
     :param hyperparameters: File of hyper-parameters for ``load_hyperparameters``, relative to the file of the search
     :param checkpoints: Environment steps of the evaluations, ascending; the last one ends the run
     :param evaluation_episodes: Episodes of each evaluation
     :param generations: Number of generations of the evolution (the paper's "stages")
-    :param population_size: As in ``AuxLossSampler``, and so are the next ones up to ``screening``
-    :param n_random: As in ``AuxLossSampler``
-    :param n_prior: As in ``AuxLossSampler``
-    :param parents: As in ``AuxLossSampler``
-    :param replacement: As in ``AuxLossSampler``
-    :param crossover: As in ``AuxLossSampler``
-    :param horizon_change: As in ``AuxLossSampler``
-    :param random: As in ``AuxLossSampler``
-    :param max_horizon: As in ``AuxLossSampler``
-    :param operators: As in ``AuxLossSampler``
-    :param allow_duplicates: As in ``AuxLossSampler``
-    :param screening: As in ``AuxLossSampler``
-    :param initial: Losses of the first generation, by notation or name: a list, or one of them. ``published`` and
-        ``handcrafted`` stand for all losses of that kind that the search space has, and a path to a YAML file for its
-        ``aux_loss``, which may be a list
-    :param retries: How often a run that was killed is submitted again
-    :param threads: PyTorch's threads of a run; they change the last bits of a result
-    :param imports: Modules that are imported first, such as those that register environments
+    :param initial: A loss, by notation or name, or a list of losses. ``published`` and ``handcrafted`` are all losses of that
+        kind in the search space, a path to a YAML file (relative to the file of the search) is its ``aux_loss``
     :param seed: Seed of the evolution
     :param seeds: Seeds of the runs of every candidate, whose score is the mean over them
+    :param retries: How often a run that was killed is submitted again
+    :param threads: PyTorch's threads of a run; they change the last bits of a result
     :param pruner: ``none``, ``median`` or ``hyperband``
     :param cross_validation: Cross-validation, None where the configuration has none
     :param operator_selection: Operator selection, None where the configuration has none
@@ -147,10 +121,10 @@ class SearchConfig(BaseModel):
     :param overrides: Merged over the hyper-parameters of all runs
     """
 
-    model_config = FORBID
-
+    # In the order of validation: what follows may use what stands before.
     path: Annotated[Path, AfterValidator(Path.absolute)]
-    environment: str
+    imports: Annotated[tuple[str, ...], AfterValidator(training.import_modules)] = ()
+    environment: Environment
     hyperparameters: Path
     checkpoints: Checkpoints
     evaluation_episodes: PositiveInt = 10
@@ -163,16 +137,15 @@ class SearchConfig(BaseModel):
     crossover: float = 0.2
     horizon_change: float = 0.1
     random: float = 0.2
-    max_horizon: Annotated[PositiveInt, Field(le=LONGEST_HORIZON)] = MAX_HORIZON
+    max_horizon: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = MAX_HORIZON
     operators: tuple[str, ...] | None = None
     allow_duplicates: bool = False
     screening: PositiveInt = 1
-    initial: str | tuple[str | dict[str, Any], ...] = ()
-    retries: NonNegativeInt = 3
-    threads: PositiveInt = 1
-    imports: tuple[str, ...] = ()
+    initial: tuple[AuxLoss, ...] = ()
     seed: NonNegativeInt = 0
     seeds: Seeds = (0,)
+    retries: NonNegativeInt = 3
+    threads: PositiveInt = 1
     pruner: Literal["none", "median", "hyperband"] = "none"
     cross_validation: CrossValidation | None = None
     operator_selection: OperatorSelection | None = None
@@ -184,18 +157,26 @@ class SearchConfig(BaseModel):
     def _relative_to_the_file(cls, path: Path, info: ValidationInfo) -> Path:
         return info.data["path"].parent / path
 
+    @field_validator("initial", mode="plain")
+    @classmethod
+    def _losses(cls, value: Any, info: ValidationInfo) -> tuple[AuxLoss, ...]:
+        if isinstance(value, list | tuple):
+            return tuple(loss for item in value for loss in cls._losses(item, info))
+        if isinstance(value, str) and value.endswith((".yml", ".yaml")):
+            return cls._losses(training.read_yaml(info.data["path"].parent / value).get("aux_loss", []), info)
+        if value == "published":
+            losses = [candidate.loss for candidate in catalog.published()]
+        elif value == "handcrafted":
+            losses = [catalog.load(name) for name in catalog.names() if not name.startswith("aarl-")]
+        else:
+            return (catalog.resolve(value),)
+        return tuple(loss for loss in losses if _is_searched(loss, info.data))
+
     @field_validator("baselines")
     @classmethod
-    def _named_differently(cls, baselines: tuple[Baseline, ...]) -> tuple[Baseline, ...]:
+    def _names_differ(cls, baselines: tuple[Baseline, ...]) -> tuple[Baseline, ...]:
         _different(tuple(baseline.name for baseline in baselines))
         return baselines
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, values: Any) -> Any:
-        if "stages" in values:
-            raise ValueError("stages: the key is called 'generations' now")
-        return values
 
     @property
     def name(self) -> str:
@@ -209,8 +190,8 @@ class SearchConfig(BaseModel):
         :param environment: Id of the environment
         :param overrides: Merged over them, such as those of a baseline
         """
-        merged = merge(load_hyperparameters(self.hyperparameters, environment), self.overrides)
-        return check_hyperparameters(merge(merged, overrides or {}), environment, f"{self.path}: overrides")
+        merged = training.merge(training.load_hyperparameters(self.hyperparameters, environment), self.overrides)
+        return training.check_hyperparameters(training.merge(merged, overrides or {}), environment, f"{self.path}: overrides")
 
     def checkpoints_for(self, environment: str) -> tuple[int, ...]:
         """
@@ -222,35 +203,9 @@ class SearchConfig(BaseModel):
         return self.checkpoints if environment == self.environment else others.get(environment, self.checkpoints)
 
     def sampler_settings(self) -> dict[str, Any]:
-        """The arguments of ``AuxLossSampler``, the number of generations and the initial losses included."""
-        settings = {name: getattr(self, name) for name in SAMPLER_KEYS}
-        initial = [self.initial] if isinstance(self.initial, str) else self.initial
-        losses = [loss for value in initial for loss in self._losses(value)]
-        return settings | {"n_generations": self.generations, "initial": tuple(dict.fromkeys(losses))}
-
-    def _losses(self, value: Any) -> Sequence[AuxLoss]:
-        """The losses of one entry of ``initial``."""
-        if value == "published":
-            return [candidate.loss for candidate in catalog.published() if self._is_searched(candidate.loss)]
-        if value == "handcrafted":
-            losses = [catalog.load(name) for name in catalog.names() if not name.startswith("aarl-")]
-            return [loss for loss in losses if self._is_searched(loss)]
-        if isinstance(value, str) and value.endswith((".yml", ".yaml")):
-            path = self.path.parent / value
-            losses = read_yaml(path).get("aux_loss", [])
-            try:
-                return [catalog.resolve(loss) for loss in (losses if isinstance(losses, list) else [losses])]
-            except ValueError as error:
-                raise ConfigError(f"{path}: aux_loss: {error}") from None
-        return [catalog.resolve(value)]
-
-    def _is_searched(self, loss: AuxLoss) -> bool:
-        """Whether the search space has a loss."""
-        try:
-            loss_to_params(loss, self.operators)
-        except ValueError:
-            return False
-        return loss.canonical().horizon <= self.max_horizon
+        """The arguments of ``AuxLossSampler``, the number of generations included."""
+        names = [name for name in inspect.signature(AuxLossSampler).parameters if name in type(self).model_fields]
+        return {"n_generations": self.generations, **{name: getattr(self, name) for name in names}}
 
 
 def load_config(path: str | Path) -> SearchConfig:
@@ -260,44 +215,22 @@ def load_config(path: str | Path) -> SearchConfig:
     :param path: The YAML file
     :raises ConfigError: naming the file and the key that is wrong
     """
-    values = read_yaml(path)
-    if "path" in values:
-        raise ConfigError(f"{path}: path: unknown key")
-    config = validated(SearchConfig, {"path": str(Path(path).absolute()), **values}, str(path))
+    values = training.read_yaml(path)
+    for key, problem in (("path", "unknown key"), ("stages", "the key is called 'generations' now")):
+        if key in values:
+            raise ConfigError(f"{path}: {key}: {problem}")
+    config = training.validated(SearchConfig, {**values, "path": str(path)}, str(path))
     try:
-        import_modules(config.imports)
         AuxLossSampler(**config.sampler_settings())
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
-    _check_environments(config)
+    parts = [part for part in (config.cross_validation, config.operator_selection) if part]
+    for env_id in dict.fromkeys([config.environment, *(name for part in parts for name in part.environments)]):
+        baselines = config.baselines if env_id == config.environment else ()
+        for overrides in ({}, *(baseline.overrides for baseline in baselines)):
+            interval = checkpoint_interval(config.hyperparameters_for(env_id, overrides))
+            between = [step for step in config.checkpoints_for(env_id) if step % interval]
+            if between:
+                of_what = f"{interval} (train_freq x n_envs x action repeat of {env_id})"
+                raise ConfigError(f"{path}: checkpoints: must be multiples of {of_what}, {between} are not")
     return config
-
-
-def _check_environments(config: SearchConfig) -> None:
-    """Refuse environments, hyper-parameters and checkpoints that do not fit, of each run of each part."""
-    environments = {"environment": (config.environment,)}
-    if config.cross_validation:
-        environments["cross_validation.environments"] = config.cross_validation.environments
-    if config.operator_selection:
-        environments["operator_selection.environments"] = config.operator_selection.environments
-    for key, env_ids in environments.items():
-        for env_id in env_ids:
-            try:
-                full_id = resolve_env_id(env_id)
-            except ConfigError as error:
-                raise ConfigError(f"{config.path}: {key}: {error}") from None
-            if full_id != env_id:
-                raise ConfigError(f"{config.path}: {key}: write {full_id!r} for {env_id!r}")
-            baselines = config.baselines if env_id == config.environment else ()
-            for overrides in ({}, *(baseline.overrides for baseline in baselines)):
-                repeat = action_repeat(config.hyperparameters_for(env_id, overrides))
-                between = [step for step in config.checkpoints_for(env_id) if step % repeat]
-                if between:
-                    problem = f"must be multiples of the action repeat of {env_id}, {repeat}: {between} are not"
-                    raise ConfigError(f"{config.path}: checkpoints: {problem}")
-    if config.cross_validation:
-        known = {env_id for env_ids in environments.values() for env_id in env_ids}
-        for env_id in config.cross_validation.checkpoints.keys() - known:
-            nearest = difflib.get_close_matches(env_id, known, n=1, cutoff=0.0)
-            problem = f"{env_id!r} is not trained on, the nearest is {nearest[0]!r}"
-            raise ConfigError(f"{config.path}: cross_validation.checkpoints: {problem}")

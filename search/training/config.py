@@ -7,7 +7,7 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -28,7 +28,6 @@ from sb3_aarl.policies import SACAuxPolicy
 
 # How several environments run, under the names of RL-Zoo's option --vec-env.
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
-FORBID = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -136,11 +135,11 @@ def resolve_env_id(name: str) -> str:
     raise ConfigError(f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}")
 
 
-def import_modules(names: Iterable[str]) -> None:
+def import_modules(names: Sequence[str]) -> Sequence[str]:
     """
     Import a user's own modules, which register environments; those in the working directory too.
 
-    :param names: Names of the modules
+    :param names: Names of the modules, which are returned
     :raises ConfigError: naming the module that cannot be imported
     """
     if str(Path.cwd()) not in sys.path:  # it is there for `python -m`, and not for the program `aarl`
@@ -149,7 +148,8 @@ def import_modules(names: Iterable[str]) -> None:
         try:
             importlib.import_module(name)
         except ImportError as error:
-            raise ConfigError(f"imports: {name} cannot be imported: {error}") from error
+            raise ConfigError(f"{name} cannot be imported: {error}") from None
+    return names
 
 
 def merge(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,7 +167,7 @@ def merge(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any
 
 
 class _Loader(yaml.SafeLoader):
-    """Also reads ``1e-3`` as a number, which is text in YAML 1.1, and ``1e5`` as an integer; refuses a key that is there twice."""
+    """Also reads ``1e-3`` as a number, which is text in YAML 1.1, ``1e5`` as an integer; refuses a key that is there twice."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.value != "<<"]
@@ -181,13 +181,8 @@ class _Loader(yaml.SafeLoader):
         return int(number) if number.is_integer() else number
 
 
-class _Dumper(yaml.SafeDumper):
-    """Writes what ``_Loader`` reads as it was: a text that looks like 1e-4 in quotes."""
-
-
 _FLOAT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
-for _class in (_Loader, _Dumper):
-    _class.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
 _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 
 
@@ -210,15 +205,6 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: must hold a mapping, not {values!r}")
     return values
-
-
-def dump(values: Mapping[str, Any]) -> str:
-    """
-    YAML that :func:`read_yaml` reads as it was.
-
-    :param values: Plain values
-    """
-    return yaml.dump(dict(values), Dumper=_Dumper)
 
 
 def validated(model_class: type[Model], values: Mapping[str, Any], source: str) -> Model:
@@ -274,7 +260,7 @@ def _plain(annotation: Any) -> Any:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin in (Union, UnionType):
         members = [member for member in map(_plain, arguments) if member is not None]
-        return Union[tuple(members)] if {*members} - {NoneType} else None
+        return Union[tuple(members)] if {*members} - {NoneType} else None  # noqa: UP007
     if origin is Mapping:
         origin = dict
     if origin in (tuple, list, dict):
@@ -283,14 +269,16 @@ def _plain(annotation: Any) -> Any:
 
 
 def _arguments(*functions: Callable[..., Any], without: Collection[str] = ()) -> dict[str, Any]:
-    """The arguments of functions that can be plain values, as fields of a model; of their defaults is no use."""
+    """The arguments of functions that can be plain values, with their types."""
     parameters = [parameter for function in functions for parameter in inspect.signature(function).parameters.values()]
     kinds = {item.name: _plain(item.annotation) for item in parameters if item.kind != inspect.Parameter.VAR_KEYWORD}
-    return {name: (kind, None) for name, kind in kinds.items() if kind is not None and name not in without}
+    return {name: kind for name, kind in kinds.items() if kind is not None and name not in without}
 
 
-def _model(name: str, fields: Mapping[str, Any]) -> Any:
-    return create_model(name, __config__=FORBID, **fields)
+def _model(name: str, kinds: Mapping[str, Any]) -> Any:
+    """A model whose keys may all be missing: defaults are those of the functions."""
+    fields: Any = {key: (kind, None) for key, kind in kinds.items()}
+    return create_model(name, __config__=ConfigDict(extra="forbid", allow_inf_nan=False), **fields)
 
 
 def _check_aux_loss(value: Any) -> Any:
@@ -302,37 +290,33 @@ def _check_aux_loss(value: Any) -> Any:
 @functools.cache
 def _hyperparameters_model(is_dmc: bool, policy: str, encoder: str, has_arguments: bool) -> type[BaseModel]:
     """
-    The model of an environment's hyper-parameters: what SACAux, its policy and so on take.
+    The model of an environment's hyper-parameters: the arguments of SACAux, its policy and so on.
 
     :param is_dmc: Whether the environment is a task of DeepMind Control
     :param policy: Name of the policy
     :param encoder: Name of the encoder; "None", or an unknown one, for the policy's own
     :param has_arguments: Whether ``normalize`` is a mapping of arguments
     """
-    repeat = {"action_repeat": (PositiveInt, 1)}
-    env_kwargs = _arguments(make_dmc_env if is_dmc else wrap_env, without=("env_id", "env", "seed")) | repeat
-    # What SACAux passes itself is left out.
-    buffer_kwargs = _arguments(
-        WindowReplayBuffer, without=("buffer_size", "device", "n_envs", "optimize_memory_usage", "n_steps", "gamma")
-    )
     policy_class: Any = SACAux.policy_aliases.get(policy, SACAuxPolicy)
     extractor = encoder_class(encoder if encoder in ENCODERS else policy_class.default_encoder)
-    policy_kwargs = _arguments(SACPolicy, SACAuxPolicy, without=("use_sde", "augmentation", "crop_size"))
-    policy_kwargs |= {
-        "features_extractor_class": (Literal[tuple(ENCODERS)] | None, None),
-        "features_extractor_kwargs": (_model("FeaturesExtractorKwargs", _arguments(extractor)) | None, None),
-        "optimizer_kwargs": (_model("OptimizerKwargs", _arguments(Adam, without=("params", "lr"))) | None, None),
+    policy_kwargs = _arguments(SACPolicy, SACAuxPolicy, without=("use_sde", "augmentation", "crop_size")) | {
+        "features_extractor_class": Literal[tuple(ENCODERS)] | None,
+        "features_extractor_kwargs": _model("FeaturesExtractorKwargs", _arguments(extractor)) | None,
+        "optimizer_kwargs": _model("OptimizerKwargs", _arguments(Adam, without=("params", "lr"))) | None,
     }
-    fields = _arguments(SACAux, without=("env", "seed")) | {
-        "policy": (Literal[tuple(SACAux.policy_aliases)], "MlpPolicy"),
-        "aux_loss": (Annotated[str | dict[str, Any] | None, AfterValidator(_check_aux_loss)], "auto"),
-        "n_timesteps": (PositiveInt, None),
-        "n_envs": (PositiveInt, 1),
-        "vec_env": (Literal[tuple(VEC_ENVS)], "dummy"),
-        "env_kwargs": (_model("EnvKwargs", env_kwargs) | None, None),
-        "policy_kwargs": (_model("PolicyKwargs", policy_kwargs) | None, None),
-        "replay_buffer_kwargs": (_model("ReplayBufferKwargs", buffer_kwargs) | None, None),
-        "normalize": (_model("Normalize", _arguments(VecNormalize, without=("training",))) if has_arguments else bool, False),
+    env_kwargs = _arguments(make_dmc_env if is_dmc else wrap_env, without=("env_id", "env", "seed"))
+    # SACAux passes the others itself.
+    passed = ("buffer_size", "device", "n_envs", "optimize_memory_usage", "n_steps", "gamma")
+    normalize = _model("Normalize", _arguments(VecNormalize, without=("training",)))
+    kinds = _arguments(SACAux, without=("env", "seed", "_init_setup_model")) | {
+        "policy": Literal[tuple(SACAux.policy_aliases)],
+        "aux_loss": Annotated[str | dict[str, Any] | None, AfterValidator(_check_aux_loss)],
+        "n_timesteps": PositiveInt,
+        "n_envs": PositiveInt,
+        "vec_env": Literal[tuple(VEC_ENVS)],
+        "env_kwargs": _model("EnvKwargs", env_kwargs | {"action_repeat": PositiveInt}) | None,
+        "policy_kwargs": _model("PolicyKwargs", policy_kwargs) | None,
+        "replay_buffer_kwargs": _model("ReplayBufferKwargs", _arguments(WindowReplayBuffer, without=passed)) | None,
+        "normalize": normalize if has_arguments else bool,
     }
-    fields.pop("_init_setup_model", None)
-    return _model("Hyperparameters", fields)
+    return _model("Hyperparameters", kinds)
