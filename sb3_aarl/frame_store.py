@@ -1,0 +1,215 @@
+"""FrameStore: each frame once; stacks and next observations are put together when they are read."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+
+
+def rows_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """
+    :param one: (n, ...)
+    :param other: Of a shape that broadcasts to that
+    :return: (n,), whether all values of a row are equal
+    """
+    return (one == other).reshape(len(one), -1).all(axis=1)
+
+
+class FrameStore:
+    """
+    The frames of one observation key, each once, in a ring that is as long as the buffer plus a stack.
+
+    Transition n (counted from the first one ever added) has its newest frame in row n, so the next observation's is in
+    row n + 1. Where an episode ends, row n + 1 belongs to the next one, and the last frame of the old one is stored
+    separately.
+
+    :param key: Key of Dict observations, else ""; named in errors
+    :param buffer_size: Transitions per env that can be read back
+    :param n_envs: Number of envs
+    :param shape: Shape of a stacked observation; frames are stacked along its first axis, oldest first
+    :param dtype: Data type of observations
+    :param stack: Number of frames in an observation
+    :param device: Device that the frames are stored on
+    """
+
+    def __init__(
+        self,
+        key: str,
+        buffer_size: int,
+        n_envs: int,
+        shape: tuple[int, ...],
+        dtype: Any,
+        stack: int,
+        device: th.device | str = "cpu",
+    ):
+        if stack < 1 or (stack > 1 and (not shape or shape[0] % stack)):
+            raise ValueError(f"frame_stack={stack} does not divide the first axis of observations of shape {shape}")
+        self.key = key
+        self.buffer_size = buffer_size
+        self.n_envs = n_envs
+        self.shape = shape
+        self.dtype = np.dtype(dtype)
+        self.stack = stack
+        self.device = device
+        self.frame_shape = (shape[0] // stack, *shape[1:]) if stack > 1 else shape
+        # Zeros of NumPy take memory as they are written to, those of PyTorch at once.
+        self.frames = th.from_numpy(np.zeros((buffer_size + stack, n_envs, *self.frame_shape), self.dtype)).to(device)
+        self.final_frames: dict[int, th.Tensor] = {}  # by place in (buffer_size, n_envs), one row after the other
+        self.zero_padded = np.zeros((buffer_size, n_envs), bool)  # whether zeros came before an episode's first frame
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Pickled tensors take several times their memory, and those of a GPU need one to be loaded.
+        return {**self.__dict__, "frames": self.frames.cpu().numpy()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.frames = th.from_numpy(state["frames"]).to(self.device)
+
+    def split(self, observations: np.ndarray) -> np.ndarray:
+        """
+        :param observations: Stacked, (n, *shape)
+        :return: (n, stack, *frame_shape), oldest first
+        """
+        return observations.reshape(len(observations), self.stack, *self.frame_shape)
+
+    def begins(self, observations: np.ndarray) -> np.ndarray:
+        """
+        :param observations: Stacked, (n, *shape)
+        :return: (n,), which of them may begin an episode: their other frames repeat the newest one, or are zeros
+        """
+        frames = self.split(observations)
+        return rows_equal(frames[:, :-1], frames[:, -1:]) | rows_equal(frames[:, :-1], np.zeros_like(frames[:, -1:]))
+
+    def check(
+        self, observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, done: np.ndarray, number: int
+    ) -> None:
+        """
+        Refuse stacks that are not made of the frames before them.
+
+        :param observations: (n_envs, *shape)
+        :param next_observations: (n_envs, *shape)
+        :param starts: (n_envs,), whether the observation begins an episode
+        :param done: (n_envs,), whether the episode is over
+        :param number: Number of the transition
+        :raises ValueError: naming the wrapper order
+        """
+        old, new = self.split(observations), self.split(next_observations)
+        problems = {
+            "an episode begins neither with one frame repeated nor with zeros": starts & ~self.begins(observations),
+            # VecNormalize returns an episode's last observation with rounding errors.
+            "the next observation is not the last one plus one new frame": ~done & ~rows_equal(new[:, :-1], old[:, 1:]),
+        }
+        for problem, wrong in problems.items():
+            if wrong.any():
+                raise ValueError(
+                    f"frame_stack={self.stack} does not fit observations{f' under {self.key!r}' if self.key else ''} of "
+                    f"shape {self.shape} (env {int(wrong.argmax())}, transition {number}): {problem}. The stack has to be the "
+                    "outermost observation wrapper, along the channels, oldest frame first: action repeat, rendering and "
+                    "resizing inside, FrameStackObservation or VecFrameStack outside. If observations are no stacks, pass "
+                    "replay_buffer_kwargs=dict(frame_stack=1). If the environments were stepped outside of learn(), or the "
+                    "buffer was emptied inside an episode, reset the environments"
+                )
+
+    def put(self, number: int, observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray) -> None:
+        """
+        :param number: Number of the transition, the next one
+        :param observations: (n_envs, *shape)
+        :param next_observations: (n_envs, *shape)
+        :param starts: (n_envs,), whether the observation begins an episode
+        """
+        for env in range(self.n_envs):
+            self.final_frames.pop(self._place(number, env), None)
+        old, new = self.split(observations), self.split(next_observations)
+        for row, frames in ((number, old), (number + 1, new)):
+            self.frames[row % len(self.frames)] = th.from_numpy(np.array(frames[:, -1], self.dtype))
+        position = number % self.buffer_size
+        padded = ~rows_equal(old[:, :-1], old[:, -1:])
+        self.zero_padded[position] = np.where(starts, padded, self.zero_padded[position - 1])
+
+    def put_final(self, number: int, envs: np.ndarray) -> None:
+        """
+        Store the last frames of episodes separately.
+
+        :param number: Number of the last transition
+        :param envs: (n_envs,), whether the episode is over
+        """
+        for env in np.flatnonzero(envs).tolist():
+            self.final_frames[self._place(number, env)] = self.frames[(number + 1) % len(self.frames), env].clone()
+
+    def _place(self, number: int, env: int) -> int:
+        return number % self.buffer_size * self.n_envs + env
+
+    def gather(
+        self, places: np.ndarray, newest: np.ndarray, age: np.ndarray, final: np.ndarray, crop_size: int | None = None
+    ) -> th.Tensor:
+        """
+        Stacked observations; all arrays broadcast to the shape (...) of ``newest``.
+
+        :param places: Places of their transitions in (buffer_size, n_envs), one row after the other
+        :param newest: Number of the transition whose row holds the newest frame
+        :param age: How many frames of the same episode came before the newest one
+        :param final: Whether the newest frame is stored separately
+        :param crop_size: Height and width in pixels that each observation is cropped to, at a place of its own, uniform
+            over all; the frames of a stack stay together. None for no crop
+        :return: (..., *shape), height and width those of the crop, on ``device``
+        """
+        places, age, final = (np.broadcast_to(array, newest.shape) for array in (places, age, final))
+        back = np.arange(self.stack)[::-1]
+        rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
+        numbers = th.from_numpy(rows * self.n_envs + places[..., None] % self.n_envs)
+        if crop_size is None:
+            frames = self.frames.flatten(0, 1).index_select(0, numbers.flatten().to(self.device))
+        else:
+            top, left = (th.randint(length - crop_size + 1, newest.shape) for length in self.frame_shape[1:])
+            frames = self._crops(numbers, top, left, crop_size)
+        stacked = frames.view(*numbers.shape, *frames.shape[1:])
+        # Few are at an episode's end or begin.
+        for index in map(tuple, np.argwhere(final).tolist()):
+            frame = self.final_frames[int(places[index])]
+            if crop_size is not None:
+                frame = frame[:, top[index] : top[index] + crop_size, left[index] : left[index] + crop_size]
+            stacked[(*index, -1)] = frame
+        padded = (back > age[..., None]) & self.zero_padded.take(places)[..., None]
+        for index in map(tuple, np.argwhere(padded).tolist()):
+            stacked[index] = 0
+        return stacked.flatten(newest.ndim, newest.ndim + 1) if self.stack > 1 else stacked.squeeze(newest.ndim)
+
+    def _crops(self, numbers: th.Tensor, top: th.Tensor, left: th.Tensor, size: int) -> th.Tensor:
+        """
+        Crops while frames are gathered, ten times as fast as afterwards.
+
+        :param numbers: Numbers of the frames as they are in memory, (..., stack)
+        :param top: First row of each crop, (...)
+        :param left: First column
+        :param size: Height and width
+        :return: (number of frames, channels, size, size)
+        """
+        channels, height, width = self.frame_shape
+        rows = ((numbers[..., None] * channels + th.arange(channels))[..., None] * height + th.arange(size)) * width
+        starts = rows + (top * width + left)[..., None, None, None]
+        pixels = self.frames.flatten().unfold(0, size, 1)  # ``size`` pixels from every one on, nothing copied yet
+        return pixels.index_select(0, starts.flatten().to(self.device)).view(-1, channels, size, size)
+
+    def training_state(self, n_added: int) -> dict[str, th.Tensor]:
+        """
+        :param n_added: Number of transitions ever added
+        :return: What is stored, for ``load_training_state``; it shares memory with the store
+        """
+        # Through NumPy: torch.save writes all that a slice of a tensor is a part of.
+        frames = th.from_numpy(self.frames[: n_added + 1].cpu().numpy())
+        finals = list(self.final_frames.values()) or [th.empty(self.frame_shape, dtype=frames.dtype)]
+        return {
+            "frames": frames,
+            "final_places": th.tensor(list(self.final_frames), dtype=th.int64),
+            "final_frames": th.stack(finals)[: len(self.final_frames)].cpu(),
+            "zero_padded": th.from_numpy(self.zero_padded[:n_added]),
+        }
+
+    def load_training_state(self, state: dict[str, th.Tensor]) -> None:
+        """
+        :param state: Of a store of the same settings
+        """
+        self.frames[: len(state["frames"])] = state["frames"]
+        self.zero_padded[: len(state["zero_padded"])] = state["zero_padded"].cpu().numpy()
+        pairs = zip(state["final_places"].tolist(), state["final_frames"].to(self.device), strict=True)
+        self.final_frames = {place: frame.clone() for place, frame in pairs}
