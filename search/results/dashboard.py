@@ -1,139 +1,115 @@
-"""optuna-dashboard for searches: what stands in the notes, the evolution plot, and the server."""
+"""optuna-dashboard for searches: notes of the study and its trials, the evolution plot, and the server."""
 
 import io
-import json
 import math
 import re
 import tempfile
 import textwrap
-import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-from optuna import Study
-from optuna.artifacts import FileSystemArtifactStore, upload_artifact
+from optuna import Study, Trial
+from optuna.artifacts import FileSystemArtifactStore, get_all_artifact_meta, upload_artifact
 from optuna.storages import BaseStorage
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial
 from optuna_dashboard import run_server, save_note, save_plotly_graph_object
-from optuna_dashboard._note import get_note_from_system_attrs
 from optuna_dashboard.artifact import get_artifact_path
 
 from sb3_aarl.aux_loss import AuxLoss
+from search.results.analysis import trial_table
 from search.results.notation import subscripts
 from search.results.plots import evolution_figure, learning_curve_png
-from search.results.trials import curve_of, lineage, loss_of, operation_of, parents_of, score_of, stage_of, trained_loss_of
+from search.results.trials import Curve, curve_of, generation_of, lineage, loss_of, operation_of, parents_of, score_of
 
 ARTIFACTS = "artifacts"  # folder of the pictures in notes
+PICTURE = "learning-curve.png"
 PLOT_ID = "evolution"
-# Notes live in the attributes of the study, of which every worker and every page of the dashboard reads all.
+# Notes are attributes of the study, of which every page of the dashboard reads all.
 MAX_ANCESTORS = 12
 MAX_CURVE_ROWS = 20
 MAX_TEXT = 300
-BEGUN = "**State:** begun"
 
-HOW_TO_READ_SEARCH = """\
+HOW_TO_READ = """\
 - Each **trial** trains one candidate: an auxiliary loss `{source} -> {target}`, from which tokens of a window of \
-experience which others are predicted. Its value is the area under its learning curve, its note says what it is.
-- **Stages**: the best quarter of a stage are the parents of the next. The trials' user attributes `stage`, \
-`operation` and `parents` tell where a candidate comes from.
-- The plot **evolution** shows the scores of all candidates by stage. The parameters are one boolean for every token, \
+experience which others are predicted. Its value is the area under its learning curve, its note describes it.
+- **Generations**: the best quarter of a generation are the parents of the next. The trials' user attributes `generation`, \
+`operation` and `parents` show where a candidate comes from.
+- The plot **evolution** shows the scores of all candidates by generation. The parameters are one boolean for every token, \
 so that their importances are the tokens'."""
-
-HOW_TO_READ_RUNS = """\
-Each **trial** is one training of a list that was given: its user attributes `variant`, `environment` and `seed` tell \
-which. Its value is the area under its learning curve. Nothing is searched here, so trials have no parameters."""
 
 
 def artifacts(folder: Path) -> FileSystemArtifactStore:
     """
-    Where the pictures of a run's folder are.
+    Where the pictures of a search are.
 
-    :param folder: Folder of the run, made if it is not there
+    :param folder: Folder of the search, made if it is not there
     """
     path = folder / ARTIFACTS
     path.mkdir(parents=True, exist_ok=True)
     return FileSystemArtifactStore(path)
 
 
-def annotate_study(study: Study, settings: Mapping[str, Any], provenance: Mapping[str, Any], is_search: bool = True) -> None:
+def annotate_study(study: Study, settings: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
     """
     Write the study's note: what is searched, with which settings, on which commit, and how to read it.
 
     :param study: The study
     :param settings: Names and values of its settings
-    :param provenance: As ``search.training.provenance.provenance`` gives it
-    :param is_search: False for a list of given runs
+    :param provenance: As returned by ``search.training.provenance.provenance``
     """
-    title = "Search for auxiliary losses" if is_search else "Trainings"
-    note = [f"## {title}: {_escape(study.study_name)}", HOW_TO_READ_SEARCH if is_search else HOW_TO_READ_RUNS]
+    note = [f"## Search for auxiliary losses: {_escape(study.study_name)}", HOW_TO_READ]
     for heading, values in (("Settings", settings), ("Where it comes from", provenance)):
         rows = [(_escape(name), _escape(value)) for name, value in values.items()]
         note += [f"### {heading}", _table(("name", "value"), rows)]
     save_note(study, "\n\n".join(note))
 
 
-def annotate_trial(study: Study, trial: FrozenTrial | int, artifact_store: FileSystemArtifactStore | None = None) -> None:
+def annotate_trial(study: Study, trial: Trial, artifact_store: FileSystemArtifactStore | None = None) -> None:
     """
-    Write the note of a trial: its loss, where it comes from, and its learning curve.
-
-    It may be written again, while the trial runs (its curve then grows) and after it.
+    Write or replace the note of a running trial: its loss, where it comes from, and its learning curve so far. State and
+    score are shown beside it by the dashboard.
 
     :param study: The study
-    :param trial: The trial, or its number
+    :param trial: The trial
     :param artifact_store: Where the picture of the learning curve goes; None for the table alone
     """
     trials = study.get_trials(deepcopy=False)
-    trial = trials[trial if isinstance(trial, int) else trial.number]
-    # Until all seeds are done there is what was reported of the first.
-    reported = [(step, mean, math.nan) for step, mean in sorted(trial.intermediate_values.items())]
-    loss, curve = trained_loss_of(trial), curve_of(trial) or reported
-    note = [*_loss_lines(trial, loss), _origin(trial)]
-    if "reason" in trial.user_attrs:
-        note.append(f"**Reason:** {_escape(trial.user_attrs['reason'])}")
+    frozen = trials[trial.number]
+    loss, curve = loss_of(frozen), _curve_so_far(frozen)
+    note = [*_loss_lines(frozen, loss), _origin(frozen)]
+    if "reason" in frozen.user_attrs:
+        note.append(f"**Reason of the failure:** {_escape(frozen.user_attrs['reason'])}")
     if curve:
         # The last evaluation is always among the rows.
-        shown = curve[:: -len(curve) // MAX_CURVE_ROWS]
-        rows = [(step, f"{mean:.1f}", "-" if math.isnan(std) else f"{std:.1f}") for step, mean, std in shown]
-        note += ["#### Learning curve", _table(("environment steps", "mean", "std"), rows[::-1])]
+        points = curve[:: -len(curve) // MAX_CURVE_ROWS][::-1]
+        rows = [(steps, f"{mean:.1f}", "-" if math.isnan(std) else f"{std:.1f}") for steps, mean, std in points]
+        note += ["#### Learning curve", _table(("environment steps", "mean", "std"), rows)]
         if artifact_store is not None:
-            note.append(f"![Learning curve]({_picture(study, trial, loss, curve, artifact_store)})")
-    if ancestors := lineage(trial, trials):
+            note.append(f"![Learning curve]({_picture(trial, loss, curve, artifact_store)})")
+    if ancestors := lineage(frozen, trials):
         nearest = sorted(ancestors[:MAX_ANCESTORS], key=lambda ancestor: -ancestor.number)
-        note += ["#### Lineage", _table(("trial", "stage", "from", "score", "loss"), [_ancestor(other) for other in nearest])]
+        header = ("trial", "generation", "from", "score", "loss")
+        note += ["#### Lineage", _table(header, [_ancestor(ancestor) for ancestor in nearest])]
         if len(ancestors) > len(nearest):
             note.append(f"… and {len(ancestors) - len(nearest)} more ancestors.")
-    save_note(_noted(study, trial), "\n\n".join(note))
-
-
-def annotate_ended(study: Study, artifact_store: FileSystemArtifactStore) -> None:
-    """
-    Write the notes of failed trials again that still say that they run: their workers died, or were interrupted.
-
-    :param study: The study
-    :param artifact_store: As for :func:`annotate_trial`
-    """
-    attrs = study._storage.get_study_system_attrs(study._study_id)
-    for trial in study.get_trials(deepcopy=False, states=(TrialState.FAIL,)):
-        if BEGUN in get_note_from_system_attrs(attrs, trial._trial_id)["body"]:
-            annotate_trial(study, trial, artifact_store)
+    save_note(trial, "\n\n".join(note))
 
 
 def update_plots(study: Study, baselines: Iterable[tuple[str, float]] = ()) -> None:
     """
-    Write or replace the evolution plot of the study. It holds every candidate: once a stage is often enough.
+    Write or replace the evolution plot of the study. It holds every candidate: once a generation is often enough.
 
     :param study: The study
     :param baselines: Names and scores of horizontal lines
     """
-    figure = evolution_figure(study.get_trials(deepcopy=False), baselines, study.direction)
+    figure = evolution_figure(trial_table(study.get_trials(deepcopy=False)), baselines, study.direction)
     save_plotly_graph_object(study, figure, graph_object_id=PLOT_ID)
 
 
 def serve(storage: BaseStorage, artifact_path: str | Path, host: str = "127.0.0.1", port: int = 8080) -> None:
     """
-    Serve optuna-dashboard until it is interrupted. Whoever reaches it can change and delete studies.
+    Serve optuna-dashboard until it is interrupted. Everybody who reaches it can change and delete studies.
 
     :param storage: The storage of the studies
     :param artifact_path: Folder of the artifact store, made if it is not there
@@ -144,11 +120,13 @@ def serve(storage: BaseStorage, artifact_path: str | Path, host: str = "127.0.0.
     run_server(storage, host=host, port=port, artifact_store=FileSystemArtifactStore(artifact_path))
 
 
+def _curve_so_far(trial: FrozenTrial) -> Curve:
+    """The learning curve; until all seeds are finished, what was reported to Optuna, which has no deviations."""
+    return curve_of(trial) or [(step, mean, math.nan) for step, mean in sorted(trial.intermediate_values.items())]
+
+
 def _loss_lines(trial: FrozenTrial, loss: AuxLoss | None) -> list[str]:
-    # The dashboard shows no HTML in notes, unless it is told to trust all of them with scripts: no MathML there.
-    if loss is None and "variant" in trial.user_attrs:
-        none = ["No auxiliary loss."] if trial.user_attrs.get("loss") == "none" else []
-        return [f"### {_escape(trial.user_attrs['variant'])}", *none]
+    # The dashboard shows no HTML in notes, unless it is configured to trust all of them with scripts: no MathML there.
     if loss is None:
         return [f"### Trial {trial.number}", "It has no valid loss."]
     canonical = f"Canonical: `{loss.canonical()}`" if loss.canonical() != loss else "This is its canonical form."
@@ -161,62 +139,30 @@ def _wrap(latex: str, width: int) -> list[str]:
 
 
 def _origin(trial: FrozenTrial) -> str:
-    score, parents = score_of(trial), parents_of(trial)
-    ended = f"**Score:** {score:.2f}" if score is not None else f"**State:** {trial.state.name.lower()}"
-    text = ended if trial.state.is_finished() else BEGUN
-    if "variant" in trial.user_attrs:
-        cell = {name: trial.user_attrs.get(name) for name in ("variant", "environment", "seed")}
-        return text + "".join(f". **{name.capitalize()}:** {_escape(value)}" for name, value in cell.items()) + "."
-    text += f". **Stage:** {stage_of(trial)}. **Operation:** {_escape(operation_of(trial))}"
-    return text + (f" of trial {' and trial '.join(map(str, parents))}." if parents else ".")
+    parents = " and trial ".join(map(str, parents_of(trial)))
+    operation = _escape(operation_of(trial)) + (f" of trial {parents}" if parents else "")
+    return f"**Generation:** {generation_of(trial)}. **Operation:** {operation}."
 
 
 def _ancestor(trial: FrozenTrial) -> tuple[Any, ...]:
     score, loss = score_of(trial), loss_of(trial)
     origin = _escape(" ".join([operation_of(trial), *map(str, parents_of(trial))]))
     notation = f"`{textwrap.shorten(str(loss), 100, placeholder=' …')}`" if loss else "-"
-    return trial.number, stage_of(trial), origin, "-" if score is None else f"{score:.1f}", notation
+    return trial.number, generation_of(trial), origin, "-" if score is None else f"{score:.1f}", notation
 
 
-def _picture(
-    study: Study,
-    trial: FrozenTrial,
-    loss: AuxLoss | None,
-    curve: Sequence[tuple[int, float, float]],
-    store: FileSystemArtifactStore,
-) -> str:
-    """The path of the curve's picture on the server; it is drawn once for each length of the curve."""
-    storage, name = study._storage, f"learning-curve-{curve[-1][0]}.png"
-    # The dashboard knows two places: attributes of the trial, where Optuna writes, and of the study, because those of
-    # a finished trial cannot be changed.
-    study_prefix = f"dashboard:artifacts:{trial._trial_id}:"
-    known = {key: value for key, value in trial.system_attrs.items() if key.startswith("artifacts:")}
-    study_attrs = dict(storage.get_study_system_attrs(study._study_id))
-    known |= {key: value for key, value in study_attrs.items() if key.startswith(study_prefix)}
-    for value in known.values():
-        meta = json.loads(value)
-        if meta is not None and meta["filename"] == name:  # None: deleted in the dashboard
-            return get_artifact_path(_noted(study, trial), meta["artifact_id"])
-
+def _picture(trial: Trial, loss: AuxLoss | None, curve: Curve, store: FileSystemArtifactStore) -> str:
+    """The path of the curve's picture on the server; there is one for each trial, drawn again when the curve grows."""
     typeset = [f"${line}$" for line in _wrap(loss.latex(), 130)] if loss else []
-    title = "\n".join([f"Trial {trial.number}", *typeset])
-    picture = learning_curve_png(curve, title)
-    if trial.state.is_finished():
-        artifact_id = str(uuid.uuid4())
-        meta = {"artifact_id": artifact_id, "filename": name, "mimetype": "image/png", "encoding": None}
-        store.write(artifact_id, io.BytesIO(picture))
-        storage.set_study_system_attr(study._study_id, study_prefix + artifact_id, json.dumps(meta))
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, name)
-            path.write_bytes(picture)
-            artifact_id = upload_artifact(artifact_store=store, file_path=str(path), study_or_trial=trial, storage=storage)
-    return get_artifact_path(_noted(study, trial), artifact_id)
-
-
-def _noted(study: Study, trial: FrozenTrial) -> Any:
-    """What optuna-dashboard's functions read of a Trial, which cannot be had of a finished one."""
-    return SimpleNamespace(storage=study._storage, study=study, _trial_id=trial._trial_id)
+    picture = learning_curve_png(curve, "\n".join([f"Trial {trial.number}", *typeset]))
+    uploaded = [meta.artifact_id for meta in get_all_artifact_meta(trial) if meta.filename == PICTURE]
+    if uploaded:
+        store.write(uploaded[0], io.BytesIO(picture))
+        return get_artifact_path(trial, uploaded[0])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, PICTURE)
+        path.write_bytes(picture)
+        return get_artifact_path(trial, upload_artifact(artifact_store=store, file_path=str(path), study_or_trial=trial))
 
 
 def _escape(text: object) -> str:

@@ -1,65 +1,55 @@
-"""What the trials of a study say, for plots, notes and reports: their loss, stage, learning curve and ancestors."""
+"""Trials of a study for plots, notes and reports: their loss, generation, learning curve and ancestors."""
 
 import math
 from collections.abc import Iterable, Sequence
 
+from optuna import Trial
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_aarl.aux_loss import AuxLoss
-from search.evolution.space import params_to_loss
+from search.evolution.space import loss_of
 
-# User attribute: list of [environment steps, mean return, standard deviation].
-CURVE_KEY = "curve"
+__all__ = ["curve_of", "generation_of", "lineage", "loss_of", "operation_of", "parents_of", "ranked", "score_of", "seconds_of"]
 
-
-def loss_of(trial: FrozenTrial) -> AuxLoss | None:
-    """The loss of a trial; None if it was never asked for one, or for one that is not valid."""
-    try:
-        return params_to_loss(trial.params)
-    except (KeyError, ValueError):
-        return None
+Curve = list[tuple[int, float, float]]
 
 
-def trained_loss_of(trial: FrozenTrial) -> AuxLoss | None:
-    """The loss that a trial trains: :func:`loss_of`, or what was given to a run of a list of runs."""
-    try:
-        return loss_of(trial) or AuxLoss.parse(str(trial.user_attrs.get("loss")))
-    except ValueError:
-        return None
+def generation_of(trial: FrozenTrial | Trial) -> int:
+    """The generation of a trial; other samplers than AuxLossSampler have one generation only."""
+    return trial.user_attrs.get("generation", 1)
 
 
-def stage_of(trial: FrozenTrial) -> int:
-    """The stage of a trial; other samplers than AuxLossSampler have one stage only."""
-    stage = trial.user_attrs.get("stage")
-    return stage if isinstance(stage, int) else 1
+def operation_of(trial: FrozenTrial | Trial) -> str:
+    """What made the candidate, such as ``crossover``; ``-`` under other samplers."""
+    return trial.user_attrs.get("operation", "-")
 
 
-def operation_of(trial: FrozenTrial) -> str:
-    """What the candidate came from, ``-`` under other samplers."""
-    return str(trial.user_attrs.get("operation", "-"))
+def parents_of(trial: FrozenTrial | Trial) -> list[int]:
+    """Numbers of the trials that a candidate descends from."""
+    return list(trial.user_attrs.get("parents", ()))
 
 
-def parents_of(trial: FrozenTrial) -> list[int]:
-    """Numbers of the trials that a candidate stems from; a trial that had to wait for its place has a lower one than they."""
-    parents = trial.user_attrs.get("parents")
-    if not isinstance(parents, list):
-        return []
-    return [number for number in parents if isinstance(number, int) and number >= 0 and number != trial.number]
-
-
-def curve_of(trial: FrozenTrial) -> list[tuple[int, float, float]]:
+def curve_of(trial: FrozenTrial | Trial) -> Curve:
     """The learning curve of a trial as (environment steps, mean, standard deviation); empty if there is none."""
-    try:
-        return [(int(steps), float(mean), float(std)) for steps, mean, std in trial.user_attrs.get(CURVE_KEY, ())]
-    except (TypeError, ValueError):
-        return []
+    return [(int(steps), float(mean), float(std)) for steps, mean, std in trial.user_attrs.get("curve", ())]
 
 
 def score_of(trial: FrozenTrial) -> float | None:
     """The score of a completed trial; None for all others, and where it is not finite."""
     finished = trial.state == TrialState.COMPLETE and trial.value is not None and math.isfinite(trial.value)
     return trial.value if finished else None
+
+
+def seconds_of(trial: FrozenTrial) -> float | None:
+    """
+    How long a finished trial was trained: the seconds noted by the driver, else from its start to its end; None where neither
+    is known, as an interrupted trial ends when its search is resumed.
+    """
+    if not trial.state.is_finished() or trial.user_attrs.get("interrupted"):
+        return None
+    if "seconds" in trial.user_attrs:
+        return trial.user_attrs["seconds"]
+    return None if trial.duration is None else trial.duration.total_seconds()
 
 
 def ranked(trials: Iterable[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> list[FrozenTrial]:
@@ -70,13 +60,11 @@ def ranked(trials: Iterable[FrozenTrial], direction: StudyDirection = StudyDirec
     :param direction: The study's
     """
     sign = -1 if direction == StudyDirection.MAXIMIZE else 1
-    scores = {trial.number: score_of(trial) for trial in trials}
-    scored = [(sign * score, number) for number, score in scores.items() if score is not None]
-    by_number = {trial.number: trial for trial in trials}
-    return [by_number[number] for _, number in sorted(scored)]
+    scores = [(score, trial) for trial in trials if (score := score_of(trial)) is not None]
+    return [trial for _, trial in sorted(scores, key=lambda scored: (sign * scored[0], scored[1].number))]
 
 
-def lineage(trial: FrozenTrial, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+def lineage(trial: FrozenTrial | Trial, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
     """
     All ancestors of a trial. The line through the first parent of each comes first, back to its end.
 
@@ -87,7 +75,7 @@ def lineage(trial: FrozenTrial, trials: Sequence[FrozenTrial]) -> list[FrozenTri
     stack = parents_of(trial)[::-1]
     while stack:
         number = stack.pop()
-        if number not in ancestors and number != trial.number and number < len(trials):
+        if number not in ancestors:
             ancestors[number] = trials[number]
             stack.extend(parents_of(trials[number])[::-1])
     return list(ancestors.values())

@@ -1,0 +1,115 @@
+"""rliable's statistics of a benchmark (Agarwal et al. 2021): interquartile means and probabilities of improvement."""
+
+import math
+from collections.abc import Sequence
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from sb3_aarl.envs import PREFIX
+from search.execution.matrix import task_name
+
+# Resamples of the bootstrap.
+RESAMPLES = 9999
+CONFIDENCE = 0.95
+# Tasks whose returns are on one scale, 0 to 1000.
+SUITE = "DeepMind Control"
+
+
+def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
+    """
+    Interquartile mean (IQM) of the returns with a 95 % interval by stratified bootstrap (Agarwal et al. 2021, rliable):
+    percentiles over resamples of the seeds within each task.
+
+    The IQM is over returns as they are, so only over tasks of one scale: those of DeepMind Control (0 to 1000) together,
+    each other environment by itself. Only tasks count that all variants of the checkpoint have runs on, and of each variant
+    the seeds that it has on all of them, so that every task weighs the same; variants without any run are left out.
+
+    :param runs: As returned by ``table.read_runs``
+    :param n_resamples: Resamples of the bootstrap
+    :return: One row for each ``checkpoint``, ``tasks`` (name of the scale; of a single task its own) and ``variant``:
+        ``n_tasks``, ``planned``, ``runs`` that count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has
+        one run only), and the runs ``left_out``
+    """
+    rows = []
+    for (checkpoint, tasks), scale in runs.groupby(["checkpoint", scale_of(runs)], sort=False):
+        present = scale.dropna(subset="mean")
+        is_common = are_common(present)
+        common = list(is_common.index[is_common])
+        tasks = task_name(common[0]) if len(common) == 1 else tasks
+        for variant in present["variant"].unique() if common else ():
+            planned = scale[scale["environment"].isin(common) & (scale["variant"] == variant)]
+            matrix = planned.pivot(index="environment", columns="seed", values="mean").dropna(axis="columns")
+            samples = list(matrix.to_numpy())
+            iqm = _iqm(*samples) if matrix.size else math.nan
+            interval = _interval(samples, _iqm, n_resamples)
+            left_out = planned["mean"].count() - matrix.size
+            rows.append((checkpoint, tasks, variant, len(common), len(planned), matrix.size, iqm, *interval, left_out))
+    columns = ["checkpoint", "tasks", "variant", "n_tasks", "planned", "runs", "iqm", "low", "high", "left_out"]
+    return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
+
+
+def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
+    """
+    Probability that a run of one variant is better than one of another on the same task, a tie being half, as the mean over
+    all tasks that both have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap.
+
+    :param runs: As returned by ``table.read_runs``
+    :param n_resamples: Resamples of the bootstrap
+    :return: One row for each ``checkpoint``, ``variant`` and ``over``: ``n_tasks``, ``probability``, ``low`` and ``high``
+    """
+    rows = []
+    for checkpoint, part in runs.dropna(subset="mean").groupby("checkpoint"):
+        returns = {key: group.to_numpy() for key, group in part.groupby(["variant", "environment"])["mean"]}
+        tasks = {variant: set(group) for variant, group in part.groupby("variant")["environment"]}
+        for variant, over in permutations(part["variant"].unique(), 2):
+            if common := sorted(tasks[variant] & tasks[over]):
+                samples = [returns[name, task] for name in (variant, over) for task in common]
+                interval = _interval(samples, _improvement, n_resamples)
+                rows.append((checkpoint, variant, over, len(common), _improvement(*samples), *interval))
+    return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high"])
+
+
+def scale_of(runs: pd.DataFrame) -> pd.Series:
+    """
+    The tasks whose returns can be averaged: those of DeepMind Control together, each other one by itself.
+
+    :param runs: Rows with an ``environment``
+    """
+    return runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
+
+
+def are_common(runs: pd.DataFrame) -> pd.Series:
+    """
+    For each task, whether all variants that have any run have runs on it.
+
+    :param runs: Rows with a ``variant`` and an ``environment`` that have a run
+    """
+    return runs.groupby("environment")["variant"].nunique() == runs["variant"].nunique()
+
+
+def _iqm(*samples: np.ndarray, axis: int = -1) -> Any:
+    return stats.trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
+
+
+def _improvement(*samples: np.ndarray, axis: int = -1) -> Any:
+    """Of the first half of the samples over the second: the mean of Mann and Whitney's U, as a share of all pairs."""
+    half = len(samples) // 2
+    shares = []
+    for ours, others in zip(samples[:half], samples[half:], strict=True):
+        u = stats.mannwhitneyu(ours, others, axis=axis, method="asymptotic").statistic
+        shares.append(u / (ours.shape[axis] * others.shape[axis]))
+    return np.mean(shares, axis=0)
+
+
+def _interval(samples: Sequence[np.ndarray], statistic: Any, n_resamples: int) -> tuple[float, float]:
+    """rliable's own bootstrap needs an ``arch`` that pandas 3 breaks; scipy's, with a sample for each stratum, is the same."""
+    if min(map(len, samples)) < 2:
+        return math.nan, math.nan
+    settings = {"vectorized": True, "method": "percentile", "confidence_level": CONFIDENCE, "batch": 1000}
+    rng = np.random.default_rng(0)
+    interval = stats.bootstrap(samples, statistic, n_resamples=n_resamples, rng=rng, **settings).confidence_interval
+    return float(interval.low), float(interval.high)
