@@ -74,7 +74,7 @@ class AuxHead(nn.Module):
         self,
         windows: WindowSamples,
         tokens: Iterable[Token],
-        places: slice,
+        positions: slice,
         encode: Callable[[PyTorchObs], th.Tensor],
     ) -> th.Tensor:
         """Latent states, actions and rewards of the tokens side by side, (batch, d); all states in one encoder pass."""
@@ -83,9 +83,9 @@ class AuxHead(nn.Module):
         parts = []
         n_states = len(offsets(tokens, "s"))
         if n_states:
-            latent = encode(_select(windows.observations, places))
+            latent = encode(_select(windows.observations, positions))
             parts.append(latent.unflatten(0, (n_states, batch)).transpose(0, 1).flatten(start_dim=1))
-        # One by one: a list as an index would make a GPU wait for it.
+        # One by one: to index with a list, a GPU has to wait.
         parts += [windows.actions[:, offset] for offset in offsets(tokens, "a")]
         parts += [windows.rewards[:, offset] for offset in offsets(tokens, "r")]
         return th.cat(parts, dim=1)
@@ -101,8 +101,8 @@ def offsets(tokens: Iterable[Token], kind: str) -> list[int]:
     return [token.offset for token in tokens if token.kind == kind]
 
 
-def _select(observations: th.Tensor | dict[str, th.Tensor], places: slice) -> PyTorchObs:
-    """Of windows (batch, time, ...) those places in time, as one batch (places * batch, ...): so they lie in memory."""
+def _select(observations: th.Tensor | dict[str, th.Tensor], positions: slice) -> PyTorchObs:
+    """Some positions in time of windows (batch, time, ...), as one batch (positions * batch, ...): the order in memory."""
     if isinstance(observations, dict):
-        return {key: value.transpose(0, 1)[places].flatten(end_dim=1) for key, value in observations.items()}
-    return observations.transpose(0, 1)[places].flatten(end_dim=1)
+        return {key: value.transpose(0, 1)[positions].flatten(end_dim=1) for key, value in observations.items()}
+    return observations.transpose(0, 1)[positions].flatten(end_dim=1)

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
 
 import torch as th
 from gymnasium import spaces
@@ -49,7 +48,7 @@ class Encoder(BaseFeaturesExtractor, ABC):
 
     :param observation_space: The observation space, one key's if it is a Dict
     :param features_dim: Width of the latent state
-    :param trunk_dim: Width of what the trunk gives
+    :param trunk_dim: Width of the trunk's output
     :param tanh: Whether to squash the latent state into (-1, 1)
     """
 
@@ -78,7 +77,7 @@ class Encoder(BaseFeaturesExtractor, ABC):
         """
         The rest.
 
-        :param trunk: What ``trunk`` gave
+        :param trunk: Output of ``trunk``
         :return: Latent states (batch, features_dim)
         """
         return self.projection(trunk)
@@ -121,19 +120,8 @@ class PixelEncoder(Encoder):
         self.convolutions.to(memory_format=th.channels_last)  # type: ignore[call-overload]
         self.projection = self.make_projection()
 
-    # PyTorch keeps it beside the parameters. In version 1 the trunk was flattened channels first.
-    _version = 2
-
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, local_metadata: dict[str, Any], *args: Any) -> None:
-        if local_metadata.get("version", self._version) < self._version:
-            raise RuntimeError(
-                "this model was saved by a version of sb3-aarl that laid images out in another way (channels first): "
-                "its encoder cannot be used any more, train it again"
-            )
-        super()._load_from_state_dict(state_dict, prefix, local_metadata, *args)
-
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        # Flattened as they lie in memory, channels last, so that nothing is copied.
+        # Flattened in the order of memory, channels last: nothing is copied.
         return self.convolutions(observations).permute(0, 2, 3, 1).flatten(start_dim=1)
 
 
@@ -175,7 +163,7 @@ class MultiInputEncoder(Encoder):
     """
     For Dict observations: a PixelEncoder for each image, one DenseMLP for all other keys together.
 
-    Each part projects its own trunk; ``make_projection`` gives the actor one projection of all trunks.
+    Each part projects its own trunk; ``make_projection`` returns one projection of all trunks, for the actor.
 
     :param observation_space: Dict of images and of anything that SB3 can flatten
     :param cnn_output_dim: Width of each image's latent state (table 7: 50; the name is SB3's CombinedExtractor's)
@@ -236,9 +224,9 @@ ENCODERS: Mapping[str, type[BaseFeaturesExtractor]] = {
 
 def encoder_class(name_or_class: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
     """
-    The features extractor that a policy asks for.
+    The features extractor of a name in plain YAML, or a class as it is.
 
-    :param name_or_class: One of ``ENCODERS``, or a class, which is returned as it is
+    :param name_or_class: One of ``ENCODERS``, or a class
     :raises ValueError: for an unknown name
     """
     if not isinstance(name_or_class, str):

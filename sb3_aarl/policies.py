@@ -43,7 +43,6 @@ class _CropsImages:
 
         :param obs: Observations (batch, ...), images as bytes
         """
-
         own = isinstance(self.features_extractor, (PixelEncoder, MultiInputEncoder))
         layout = th.channels_last if own else th.preserve_format
 
@@ -51,10 +50,10 @@ class _CropsImages:
             if self.crop_size is not None:
                 images = center_crop(images, self.crop_size)
             if not self.normalize_images:
-                return images.contiguous()  # an encoder may look at its input as one row, as PyTorch's own examples do
+                return images.contiguous()  # an encoder may call view() on its input
             if images.dtype.is_floating_point:
                 return images.float() / 255
-            # Scaled in place, in the layout that the encoder's convolutions want: images are the largest tensors there are.
+            # One copy, in the layout that the encoder's convolutions need: images are the largest tensors.
             return images.to(th.float32, memory_format=layout).div_(255)
 
         obs = map_images(obs, self.image_keys, preprocess)
@@ -75,17 +74,13 @@ def map_images(obs: PyTorchObs, image_keys: Collection[str], function: Callable[
 
 
 def has_parts(features_extractor: BaseFeaturesExtractor) -> TypeGuard[Encoder]:
-    """
-    Whether an encoder is a trunk and a projection, one after the other, and nothing else: no ``forward`` of its own.
-
-    :param features_extractor: The encoder
-    """
+    """Whether an encoder is a trunk and a projection, one after the other, and nothing else: no ``forward`` of its own."""
     return isinstance(features_extractor, Encoder) and type(features_extractor).forward is Encoder.forward
 
 
 def read_trunk(features_extractor: BaseFeaturesExtractor, obs: Any) -> th.Tensor:
     """
-    What actor and critic both read of a shared encoder: all but its projection; all of an encoder that has none.
+    Output of the part of a shared encoder that actor and critic both read: all but its projection, if it has one.
 
     :param features_extractor: The encoder
     :param obs: Preprocessed observations (batch, ...)
@@ -94,53 +89,15 @@ def read_trunk(features_extractor: BaseFeaturesExtractor, obs: Any) -> th.Tensor
 
 
 def full_precision(x: th.Tensor) -> th.Tensor:
-    """
-    What a network gave, as float32 where it computed in bfloat16.
-
-    :param x: Any floats
-    """
+    """Output of a network as float32 where it computed in bfloat16."""
     return x.float() if x.dtype == th.bfloat16 else x
-
-
-class _FewRows(th.autograd.Function):
-    """
-    A linear layer whose backward pass leaves out what a loss of the smallest Q-value does not need: rows without gradient,
-    which every critic but the smallest has, and the layer's own parameters.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
-        if th.is_autocast_enabled(x.device.type):
-            weight = weight.to(th.get_autocast_dtype(x.device.type))  # once: the backward pass needs it too
-        ctx.save_for_backward(weight)
-        return th.nn.functional.linear(x, weight, bias)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor, None, None]:
-        (gradient,), (weight,) = gradients, ctx.saved_tensors
-        rows = gradient.abs().sum(dim=1).nonzero().squeeze(1)  # several times faster than any()
-        of_inputs = gradient.new_zeros(len(gradient), weight.shape[1])
-        of_inputs.index_copy_(0, rows, gradient.index_select(0, rows) @ weight)
-        return of_inputs, None, None
-
-
-def _is_plain(network: nn.Module) -> bool:
-    """Whether a network is what SB3 made it, one layer after the other: not compiled, no hooks, no layers of another kind."""
-    return (
-        type(network) is nn.Sequential
-        and not any(
-            module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
-            for module in network.modules()
-        )
-        and all(type(module) is nn.Linear for module in network.modules() if isinstance(module, nn.Linear))
-    )
 
 
 class Trunk(NamedTuple):
     """
-    Stands for observations whose encoding is known up to the projection, so that actor and critic need not do it twice.
+    Stands for observations whose encoding is known up to the projection: computed once for actor and critic.
 
-    :param values: What the trunk of the critic's encoder gave, (batch, trunk_dim)
+    :param values: Output of the trunk of the critic's encoder, (batch, trunk_dim)
     """
 
     values: th.Tensor
@@ -258,26 +215,9 @@ class Critic(_CropsImages, ContinuousCritic):
         inputs = th.cat([latent, actions], dim=1)
         return tuple(full_precision(q_network(inputs)) for q_network in self.q_networks)
 
-    def min_q_values(self, latent: th.Tensor, actions: th.Tensor, skip_rows: bool) -> th.Tensor:
-        """
-        The smallest Q-value of all critics, for the loss of the actor.
-
-        :param latent: Latent states (batch, features_dim)
-        :param actions: (batch, action_dim), scaled to [-1, 1]
-        :param skip_rows: Whether the backward pass leaves out what it does not need: the critics' own parameters and, a row
-            having gradients of one critic only, half of two critics' rows. That is faster on CPUs and rounds in another way;
-            a GPU would wait to know which rows, and does not do it
-        :return: (batch, 1)
-        """
-        if not skip_rows or latent.device.type != "cpu" or not all(map(_is_plain, self.q_networks)):
-            return th.cat(self.q_values(latent, actions), dim=1).min(dim=1, keepdim=True).values
-        values = []
-        for q_network in self.q_networks:
-            x = th.cat([latent, actions], dim=1)
-            for layer in q_network.children():
-                x = _FewRows.apply(x, layer.weight, layer.bias) if isinstance(layer, nn.Linear) else layer(x)
-            values.append(full_precision(x))
-        return th.cat(values, dim=1).min(dim=1, keepdim=True).values
+    def q_parameters(self) -> list[nn.Parameter]:
+        """All parameters but those of the encoder."""
+        return [parameter for network in self.q_networks for parameter in network.parameters()]
 
 
 class SACAuxPolicy(SACPolicy):
@@ -297,7 +237,7 @@ class SACAuxPolicy(SACPolicy):
     :param crop_size: Height and width in pixels of cropped images, None for 84 (paper, table 7). Where it is given,
         images must not be smaller
     :param squash_log_std: None (default, SB3): the log standard deviation is clipped to [-20, 2]. Bounds such as
-        (-10, 2) (the public reference): tanh squashes it into them; gSDE, whose scale is no network's, ignores them
+        (-10, 2) (the public reference): tanh squashes it into them; gSDE ignores them
     :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases
         (CURL, the reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
     :param kwargs: activation_fn, use_sde, log_std_init, use_expln, clip_mean, normalize_images, optimizer_class,
@@ -332,12 +272,11 @@ class SACAuxPolicy(SACPolicy):
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
         encoder = encoder_class(features_extractor_class or self.default_encoder)
-        is_class = isinstance(encoder, type)  # SB3 takes whatever makes one
-        if is_class and issubclass(encoder, MultiInputEncoder) and not normalize_images:
+        if issubclass(encoder, MultiInputEncoder) and not normalize_images:
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
-        # As SB3's NatureCNN: floats that nobody scales are mostly a mistake.
-        is_for_images = is_class and issubclass(encoder, PixelEncoder)
-        assert not is_for_images or is_image_space(observation_space, normalized_image=not normalize_images), (
+        # As SB3's NatureCNN: floats that are not scaled are mostly a mistake.
+        is_image = is_image_space(observation_space, normalized_image=not normalize_images)
+        assert is_image or not issubclass(encoder, PixelEncoder), (
             f"{encoder.__name__} is for images, not for {observation_space}. Images that are floats already, such as "
             "VecNormalize's, have to be channel first and need policy_kwargs=dict(normalize_images=False)"
         )
@@ -362,16 +301,10 @@ class SACAuxPolicy(SACPolicy):
                 if isinstance(network, nn.Module):
                     network.apply(orthogonal_init)
         self.critic_target = self.make_critic()
-        for network in (self.actor.latent_pi, *self.critic.q_networks, *self.critic_target.q_networks):
-            for layer in network.children():  # not those inside of an activation function of the user's
-                if type(layer) is nn.ReLU:
-                    layer.inplace = True  # nothing needs what a linear layer gave: less memory to write
-        shared_with_target = set(self.critic.parameters()) & set(self.critic_target.parameters())
-        if any(parameter.requires_grad for parameter in shared_with_target):  # those of a frozen network never differ
-            name = getattr(self.features_extractor_class, "__name__", self.features_extractor_class)
+        if set(self.critic.parameters()) & set(self.critic_target.parameters()):
             raise ValueError(
-                f"{name} gives critic and target critic the same parameters: each needs an encoder of its own. A network that "
-                "it is made of has to be one of features_extractor_kwargs, of which each encoder gets a copy"
+                f"{self.features_extractor_class.__name__} shares parameters between critic and target critic: pass its network "
+                "in features_extractor_kwargs, and each encoder gets a copy"
             )
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.set_training_mode(False)
@@ -389,8 +322,7 @@ class SACAuxPolicy(SACPolicy):
         kwargs = dict(self.optimizer_kwargs)
         learns = any(parameter.requires_grad for parameter in self.critic.features_extractor.parameters())
         if learns and self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and not {"foreach", "fused"} & set(kwargs):
-            # Several times faster, and equal but for rounding. Around an encoder that learns nothing there is SB3's SAC
-            # left, and that is reproduced bit for bit.
+            # Several times faster, equal but for rounding. An encoder without parameters is SB3's SAC, to the bit.
             kwargs["fused"] = True
         return self.optimizer_class(parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
 
@@ -398,15 +330,9 @@ class SACAuxPolicy(SACPolicy):
         space = self.observation_space
         if self.crops:
             space = cropped_space(space, self.crop_size, not self.normalize_images)
-        kwargs = dict(self.features_extractor_kwargs)
-        # A network would else be one and the same in encoder and momentum encoder.
-        for name, network in kwargs.items():
-            if isinstance(network, nn.Module):
-                try:
-                    kwargs[name] = copy.deepcopy(network)
-                except Exception as error:  # such as that of a network with weight_norm
-                    problem = f"features_extractor_kwargs[{name!r}] cannot be copied, and each encoder needs one of its own"
-                    raise ValueError(f"{problem}: {error}") from error
+        # Encoder and momentum encoder each get a copy of a network among the arguments.
+        kwargs: dict[str, Any] = dict(self.features_extractor_kwargs)
+        kwargs |= {name: copy.deepcopy(value) for name, value in kwargs.items() if isinstance(value, nn.Module)}
         return self.features_extractor_class(space, **kwargs)
 
     @property
@@ -438,7 +364,7 @@ class SACAuxPolicy(SACPolicy):
 
         def augment(images: th.Tensor) -> th.Tensor:
             if images.ndim == 5:
-                # The buffer's windows lie in memory one time after the other.
+                # In the buffer's windows, memory is ordered by time first.
                 times = images.transpose(0, 1)
                 return augment(times.flatten(end_dim=1)).unflatten(0, times.shape[:2]).transpose(0, 1)
             return random_crop(images, self.crop_size) if self.augmentation == "random_crop" else random_shift(images)
