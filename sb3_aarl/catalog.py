@@ -20,21 +20,21 @@ class PublishedLoss(NamedTuple):
     :param table: Number of the paper's table: 9, 12, 13 or 14
     :param environment: The task that it was searched on, such as ``Cheetah-Run``
     :param observation: ``pixel`` or ``state``
-    :param stage: Stage of the evolution, from 1
-    :param rank: Place among the stage's best, from 1
+    :param generation: Generation of the evolution (the paper says "stage"), from 1
+    :param rank: Rank among the generation's best, from 1
     """
 
     loss: AuxLoss
     table: int
     environment: str
     observation: str
-    stage: int
+    generation: int
     rank: int
 
     @property
     def name(self) -> str:
-        """What :func:`load` knows it by: task, observation, stage and rank, such as ``cheetah-run-state-4-1``."""
-        return f"{self.environment.lower()}-{self.observation}-{self.stage}-{self.rank}"
+        """The name for :func:`load`: task, observation, generation and rank, such as ``cheetah-run-state-4-1``."""
+        return f"{self.environment.lower()}-{self.observation}-{self.generation}-{self.rank}"
 
 
 @cache
@@ -63,7 +63,7 @@ def load(name: str) -> AuxLoss:
     """
     The loss of that name.
 
-    :param name: One of :func:`names`, or a published candidate's; capitals are as good
+    :param name: One of :func:`names`, or a published candidate's; in any case
     :raises ValueError: for an unknown name, with the nearest ones
     """
     key = str(name).strip().lower()
@@ -81,9 +81,9 @@ def load(name: str) -> AuxLoss:
 def published() -> tuple[PublishedLoss, ...]:
     """Every candidate of the paper's tables 9, 12, 13 and 14, in their order."""
     return tuple(
-        PublishedLoss(AuxLoss.parse(notation), table["table"], table["environment"], table["observation"], stage, rank)
+        PublishedLoss(AuxLoss.parse(notation), table["table"], table["environment"], table["observation"], generation, rank)
         for table in _read()["published"]
-        for stage, candidates in table["stages"].items()
+        for generation, candidates in table["generations"].items()
         for rank, notation in enumerate(candidates, start=1)
     )
 
@@ -92,7 +92,7 @@ def resolve(value: "AuxLoss | str | Mapping[str, Any]") -> AuxLoss:
     """
     The loss that a user means: an AuxLoss, a notation, a name of the catalogue, or the mapping of ``AuxLoss.to_dict``.
 
-    :param value: What stands in code, YAML or on the command line
+    :param value: A value from code, YAML or the command line
     :raises ValueError: when it is none of these
     """
     if isinstance(value, AuxLoss):

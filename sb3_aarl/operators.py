@@ -12,7 +12,7 @@ def squared_error(prediction: th.Tensor, target: th.Tensor, negatives: bool) -> 
     Mean squared error; with negatives, minus the same error against another row of the batch.
 
     The other row is the previous one: a batch is drawn independently, so any fixed permutation without a fixed point
-    is as good as a random one. A batch of one row has no other and gives zero.
+    is as good as a random one. For a batch of one row it is zero.
 
     :param prediction: (batch, d) floats
     :param target: (batch, d) floats

@@ -302,10 +302,8 @@ class SACAuxPolicy(SACPolicy):
                     network.apply(orthogonal_init)
         self.critic_target = self.make_critic()
         if set(self.critic.parameters()) & set(self.critic_target.parameters()):
-            raise ValueError(
-                f"{self.features_extractor_class.__name__} shares parameters between critic and target critic: pass its network "
-                "in features_extractor_kwargs, and each encoder gets a copy"
-            )
+            name = self.features_extractor_class.__name__
+            raise ValueError(f"{name} shares a network between critic and target critic: pass it in features_extractor_kwargs")
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.set_training_mode(False)
         self.critic_target.requires_grad_(False)

@@ -77,7 +77,7 @@ class SACAux(SAC):
     :param device: Device of the networks
     :param aux_loss: An AuxLoss, its notation, a name of the catalogue, or None for SAC with the same encoder (the
         paper's baseline). ``"auto"`` is AARL-Pixel if any observation is an image and AARL-State otherwise, and None
-        where neither can be trained: the encoder has no parameters that learn, or the replay buffer gives no windows
+        where neither can be trained: the encoder has no parameters that learn, or the replay buffer has no windows
         (HerReplayBuffer is refused unless it is None)
     :param aux_coef: Weight lambda of the auxiliary loss (equation 1). It matters with ``joint_optimizer=True``; by
         default the auxiliary loss has an Adam of its own, which divides a constant factor out again
