@@ -1,16 +1,28 @@
-"""Configurations: the paper's tables typed in again, one clear error for whatever is wrong, nothing executed."""
+"""Configurations: the paper's searches typed in again, one clear line for each problem, nothing evaluated."""
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sb3_aarl import AuxLoss, SACAux, catalog
-from search.training.config import ConfigError, SearchConfig, load_config, load_hyperparameters, merge, resolve_env_id
+from search.studies.config import Baseline, CrossValidation, SearchConfig, load_config
+from search.training.config import (
+    ConfigError,
+    check_hyperparameters,
+    load_aux_loss,
+    load_hyperparameters,
+    merge,
+    named_environments,
+    read_yaml,
+    resolve_env_id,
+)
 from search.training.run import make_env
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
@@ -23,12 +35,16 @@ CONFIG: dict[str, Any] = {
     "checkpoints": [400, 800],
 }
 HYPER: dict[str, Any] = {"default": {"env_kwargs": {"action_repeat": 4}, "batch_size": 64}}
+FORWARD, REWARD = AuxLoss.parse("{s_t, a_t} -> {s_t+1}"), AuxLoss.parse("{s_t} -> {r_t}")
 
 
 def write(folder: Path, config: Any = CONFIG, hyper: Any = HYPER) -> Path:
     for name, values in (("search.yml", config), ("hyper.yml", hyper)):
         (folder / name).write_text(values if isinstance(values, str) else yaml.safe_dump(values), encoding="utf-8")
     return folder / "search.yml"
+
+
+# The configurations that come with the project.
 
 
 def test_the_papers_searches_are_all_there() -> None:
@@ -42,14 +58,15 @@ def test_the_papers_budgets(path: Path) -> None:
     config = load_config(path)
     pixel = path.stem.endswith("pixel")
     assert config.environment == "dm_control/{}-v0".format(path.stem.rpartition("_")[0].replace("_", "-"))
-    assert (config.n_random, config.n_prior, config.population_size, config.stages) == (100, 25, 100, 7)
+    assert (config.n_random, config.n_prior, config.population_size, config.generations) == (100, 25, 100, 7)
     shares = (config.parents, config.replacement, config.crossover, config.horizon_change, config.random)
     assert shares == (0.25, 0.5, 0.2, 0.1, 0.2)
     assert (config.max_horizon, config.operators, config.screening, config.pruner) == (10, None, 1, "none")
     assert config.evaluation_episodes == 10
     short, long = (100_000, 200_000, 300_000, 400_000, 500_000), (300_000, 600_000, 900_000, 1_200_000, 1_500_000)
+    assert config.cross_validation is not None
     assert config.cross_validation.top == 5 and len(config.cross_validation.seeds) == 3
-    assert not {*config.seeds} & {*config.cross_validation.seeds}  # or what was chosen for its luck counts again
+    assert not {*config.seeds} & {*config.cross_validation.seeds}  # or the luck that chose a candidate counts again
     environments = config.cross_validation.environments
     expected = ("cheetah-run", "reacher-easy", "walker-walk") if pixel else ("cheetah-run", "hopper-hop", "quadruped-run")
     assert environments == tuple(f"dm_control/{task}-v0" for task in expected)
@@ -57,7 +74,8 @@ def test_the_papers_budgets(path: Path) -> None:
         assert config.checkpoints_for(env_id) == (short if pixel or "cheetah" in env_id else long)
         assert config.hyperparameters_for(env_id).get("env_kwargs", {}).get("pixels", False) is pixel
     assert len(config.baselines) == 3
-    if pixel:
+    assert (config.operator_selection is not None) is pixel
+    if config.operator_selection is not None:
         assert config.operator_selection.environments == environments
         assert len(config.operator_selection.seeds) == 5
 
@@ -66,15 +84,16 @@ def test_the_papers_budgets(path: Path) -> None:
 def test_small_searches_are_smaller(path: Path) -> None:
     small, whole = load_config(path), load_config(path.with_name(path.name.replace("-small", "")))
     assert small.environment == whole.environment
+    assert small.cross_validation is not None and whole.cross_validation is not None
     assert small.cross_validation.environments == whole.cross_validation.environments
-    for name in ("stages", "population_size", "n_random", "n_prior"):
+    for name in ("generations", "population_size", "n_random", "n_prior"):
         assert getattr(small, name) < getattr(whole, name)
     assert max(small.checkpoints) <= max(whole.checkpoints) / 5
 
 
-@pytest.mark.parametrize("path", PAPER, ids=lambda path: path.stem)
-def test_every_baseline_can_be_built(path: Path) -> None:
-    config = load_config(path)
+@pytest.mark.parametrize("name", ["cheetah_run_state", "cheetah_run_pixel"])  # the others have the same baselines
+def test_every_baseline_can_be_built(name: str) -> None:
+    config = load_config(ZOO / "search" / f"{name}.yml")
     for baseline in config.baselines:
         values = config.hyperparameters_for(config.environment, baseline.overrides)
         values.pop("n_timesteps")
@@ -87,10 +106,16 @@ def test_every_baseline_can_be_built(path: Path) -> None:
             assert model.policy.augmentation == "none" and model.observation_space.shape == (9, 84, 84)
 
 
-# What the loader does.
+def test_all_searches_of_one_kind_have_the_same_baselines() -> None:
+    for kind in ("state", "pixel"):
+        baselines = {str(load_config(path).baselines) for path in SEARCHES if kind in path.stem}
+        assert len(baselines) == 1
 
 
-def test_defaults_are_the_papers_and_lists_become_tuples(tmp_path: Path) -> None:
+# Searches.
+
+
+def test_defaults_are_the_papers(tmp_path: Path) -> None:
     config = load_config(write(tmp_path))
     assert config == SearchConfig(
         path=tmp_path / "search.yml",
@@ -98,13 +123,15 @@ def test_defaults_are_the_papers_and_lists_become_tuples(tmp_path: Path) -> None
         hyperparameters=tmp_path / "hyper.yml",
         checkpoints=(400, 800),
     )
-    assert config.sampler_settings()["population_size"] == 100
+    assert config.name == "search" and config.retries == 3 and config.threads == 1
+    settings = config.sampler_settings()
+    assert (settings["population_size"], settings["n_generations"], settings["initial"]) == (100, 7, ())
 
 
-def test_everything_that_can_be_said(tmp_path: Path) -> None:
+def test_every_part_of_a_search_is_read(tmp_path: Path) -> None:
     parts = {
         "cross_validation": {
-            "environments": ["dm_control/walker-run-v0", "Pendulum-v1"],
+            "environments": ["walker-run", "Pendulum-v1"],
             "seeds": [3],
             "top": 2,
             "checkpoints": {"Pendulum-v1": [200]},
@@ -113,15 +140,20 @@ def test_everything_that_can_be_said(tmp_path: Path) -> None:
         "baselines": [
             {"name": "a", "aux_loss": "{s_t} -> {r_t}"},
             {"name": "b", "aux_loss": None, "overrides": {"policy_kwargs": {"features_extractor_class": "identity"}}},
+            {"name": "c", "aux_loss": "none"},
         ],
         "operators": ["mse", "inner"],
         "overrides": {"policy_kwargs": {"net_arch": [7]}},
     }
     config = load_config(write(tmp_path, CONFIG | parts))
-    assert config.cross_validation.seeds == (3,) and config.operator_selection.seeds == (1, 2)
-    assert config.checkpoints_for("Pendulum-v1") == (200,)
-    assert config.checkpoints_for("dm_control/walker-run-v0") == (400, 800)
-    assert [baseline.aux_loss for baseline in config.baselines] == [AuxLoss.parse("{s_t} -> {r_t}"), None]
+    walker = "dm_control/walker-run-v0"
+    assert config.cross_validation == CrossValidation(
+        environments=(walker, "Pendulum-v1"), seeds=(3,), top=2, checkpoints={"Pendulum-v1": (200,)}
+    )
+    assert config.operator_selection is not None and config.operator_selection.seeds == (1, 2)
+    assert config.checkpoints_for("Pendulum-v1") == (200,) and config.checkpoints_for(walker) == (400, 800)
+    assert config.baselines[0] == Baseline(name="a", aux_loss=REWARD)
+    assert [baseline.aux_loss for baseline in config.baselines[1:]] == [None, None]
     assert config.operators == ("mse", "inner")
     assert config.hyperparameters_for("Pendulum-v1", config.baselines[1].overrides) == {
         "env_kwargs": {"action_repeat": 4},
@@ -130,10 +162,60 @@ def test_everything_that_can_be_said(tmp_path: Path) -> None:
     }
 
 
+def test_files_are_relative_to_the_file_that_names_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "searches").mkdir()
+    write(tmp_path)
+    path = write(tmp_path / "searches", CONFIG | {"hyperparameters": "../hyper.yml", "initial": "../losses.yml"}, "")
+    (tmp_path / "losses.yml").write_text("aux_loss: reward-prediction")
+    monkeypatch.chdir(tmp_path)
+    for config in (load_config(path), load_config("searches/search.yml")):
+        assert config.hyperparameters_for("Pendulum-v1")["batch_size"] == 64
+        assert config.initial == (catalog.load("reward-prediction"),)
+        assert config.path == path
+
+
+def test_a_search_may_start_from_given_losses(tmp_path: Path) -> None:
+    (tmp_path / "winner.yml").write_text("aux_loss: '{s_t} -> {r_t}'")
+    (tmp_path / "several.yml").write_text("aux_loss: ['{s_t} -> {r_t}', forward-dynamics]")
+    published = tuple(candidate.loss for candidate in catalog.published())
+
+    def initial(value: Any, **keys: Any) -> tuple[AuxLoss, ...]:
+        return load_config(write(tmp_path, CONFIG | {"initial": value} | keys)).sampler_settings()["initial"]
+
+    assert initial("published") == published
+    assert initial("published", max_horizon=3) == tuple(loss for loss in published if loss.horizon <= 3)
+    # Without operators the space has mean squared error only; of the handcrafted losses these have it.
+    without_operators = {catalog.load(f"{name}-{kind}") for name, kind in (("forward", "dynamics"), ("inverse", "dynamics"))}
+    assert {*initial("handcrafted")} == without_operators | {
+        catalog.load("reward-prediction"),
+        catalog.load("action-inference"),
+    }
+    assert catalog.load("curl") in initial("handcrafted", operators=["mse", "bilinear"])
+    assert initial(["{s_t} -> {r_t}", "forward-dynamics"]) == initial("several.yml") == (REWARD, FORWARD)
+    assert initial("winner.yml") == initial("{s_t} -> {r_t}") == (REWARD,)
+    assert initial(["winner.yml", REWARD.to_dict(), "published"]) == (REWARD, REWARD, *published)
+
+
+def test_imported_modules_may_register_environments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_envs.py").write_text(
+        "import gymnasium as gym\ngym.register('Own-v0', 'gymnasium.envs.classic_control.pendulum:PendulumEnv')\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    try:
+        config = load_config(write(tmp_path, CONFIG | {"environment": "Own-v0", "imports": ["own_envs"]}))
+        assert (config.environment, config.imports) == ("Own-v0", ("own_envs",))
+    finally:
+        gym.registry.pop("Own-v0", None)
+        sys.modules.pop("own_envs", None)
+
+
+# Hyper-parameters.
+
+
 def test_an_environments_own_entry_is_merged_over_the_default(tmp_path: Path) -> None:
     own = {"env_kwargs": {"frame_stack": 2}, "learning_rate": "REPLACED"}
-    text = yaml.safe_dump(HYPER | {"Pendulum-v1": own}).replace("REPLACED", "1e-3")
-    write(tmp_path, hyper=text + "\nn_envs: {}\n")
+    write(tmp_path, hyper=yaml.safe_dump(HYPER | {"Pendulum-v1": own}).replace("REPLACED", "1e-3"))
     path = tmp_path / "hyper.yml"
     assert load_hyperparameters(path, "Pendulum-v1") == {
         "env_kwargs": {"action_repeat": 4, "frame_stack": 2},
@@ -141,6 +223,40 @@ def test_an_environments_own_entry_is_merged_over_the_default(tmp_path: Path) ->
         "learning_rate": 0.001,  # YAML 1.1 would have taken it for text
     }
     assert load_hyperparameters(path, "dm_control/fish-swim-v0") == HYPER["default"]
+    assert named_environments(path) == ["Pendulum-v1"]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("buffer_size: 1e5", 100_000),
+        ("buffer_size: 100000.0", 100_000),
+        ("tau: 1", 1.0),
+        ("tau: 5.0e-3", 0.005),
+        ("train_freq: 2", 2),
+        ("train_freq: [1, episode]", (1, "episode")),  # SB3 requires a tuple
+        ("ent_coef: 0.1", 0.1),
+        ("ent_coef: auto_0.1", "auto_0.1"),
+        ("encoder_learning_rate: null", None),
+        ("ent_coef_betas: [0.5, 0.999]", (0.5, 0.999)),
+        ("aux_loss: auto", "auto"),
+        ("aux_loss: none", None),
+        ("aux_loss: '{s_t} -> {r_t}'", "{s_t} -> {r_t}"),
+        ("normalize: true", True),
+        ("normalize: {norm_reward: false, clip_obs: 5}", {"norm_reward": False, "clip_obs": 5.0}),
+        ("vec_env: subproc", "subproc"),
+        ("policy_kwargs: {net_arch: {pi: [8], qf: [4]}}", {"net_arch": {"pi": [8], "qf": [4]}}),
+        ("policy_kwargs: {features_extractor_kwargs: null}", {"features_extractor_kwargs": None}),
+        ("policy_kwargs: {optimizer_kwargs: {betas: [0.9, 0.99]}}", {"optimizer_kwargs": {"betas": (0.9, 0.99)}}),
+        ("replay_buffer_kwargs: {frame_stack: {image: 3}}", {"frame_stack": {"image": 3}}),
+    ],
+)
+def test_values_have_the_types_of_the_arguments(tmp_path: Path, text: str, value: Any) -> None:
+    (tmp_path / "hyper.yml").write_text(f"default:\n  {text}\n")
+    ((key, read),) = load_hyperparameters(tmp_path / "hyper.yml", "Pendulum-v1").items()
+    assert key == text.partition(":")[0]
+    assert read == value and type(read) is type(value)
+    assert check_hyperparameters({key: read}, "Pendulum-v1", "again") == {key: read}
 
 
 mappings = st.recursive(
@@ -169,93 +285,106 @@ def test_short_names_of_environments() -> None:
     assert resolve_env_id("cheetah-run") == resolve_env_id("dm_control/cheetah-run-v0") == "dm_control/cheetah-run-v0"
     assert resolve_env_id("Cheetah-Run") == "dm_control/cheetah-run-v0"  # the paper's
     assert resolve_env_id("Pendulum-v1") == "Pendulum-v1"
-    with pytest.raises(ValueError, match="cheetah-run"):
+    with pytest.raises(ConfigError, match="cheetah-run"):
         resolve_env_id("chetah-run")
 
 
+def test_a_file_of_one_loss(tmp_path: Path) -> None:
+    path = tmp_path / "winner.yml"
+    for text, problem in (("a: 1", "aux_loss"), ("aux_loss: curll", "aux_loss.*curl"), ("aux_loss: 3", "aux_loss")):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=rf"winner.yml.*{problem}"):
+            load_aux_loss(path)
+    path.write_text("aux_loss: curl")
+    assert load_aux_loss(path) == catalog.load("curl")
+
+
+# What is refused.
+
 WRONG: list[tuple[dict[str, Any], str]] = [
-    ({"populaton_size": 3}, "'populaton_size'.*'population_size'"),
-    ({"path": "x"}, "unknown key 'path'"),
-    ({"cross_validation": {"environments": ["Pendulum-v1"], "sedes": [1]}}, "cross_validation.*'sedes'.*'seeds'"),
-    ({"operator_selection": {"environment": ["Pendulum-v1"]}}, "operator_selection.*'environment'.*'environments'"),
-    ({"cross_validation": {}}, "cross_validation.*environments is missing"),
-    ({"baselines": [{"name": "a", "aux_los": None}]}, r"baselines\[0\].*'aux_los'.*'aux_loss'"),
-    ({"baselines": [{"name": "a", "aux_loss": "curll"}]}, r"baselines\[0\]\.aux_loss.*curl"),
-    ({"baselines": [{"name": "a"}, {"name": "a"}]}, "baselines"),
-    ({"overrides": {"bach_size": 3}}, "overrides.*'bach_size'.*'batch_size'"),
-    ({"overrides": {"env_kwargs": {"action_repeats": 2}}}, "env_kwargs.*'action_repeats'.*'action_repeat'"),
-    ({"overrides": {"policy_kwargs": {"net_arc": [2]}}}, "policy_kwargs.*'net_arc'.*'net_arch'"),
-    ({"overrides": {"replay_buffer_kwargs": {"storage_devise": "cpu"}}}, "replay_buffer_kwargs.*'storage_device'"),
-    ({"overrides": {"replay_buffer_kwargs": {"n_envs": 2}}}, "replay_buffer_kwargs.*unknown key 'n_envs'"),
-    (
-        {"overrides": {"policy_kwargs": {"optimizer_kwargs": {"epss": 1e-5}}}},
-        r"kwargs\.optimizer_kwargs.*'epss'.*'eps'",
-    ),
-    ({"overrides": {"policy_kwargs": {"optimizer_kwargs": {"eps": "small"}}}}, "optimizer_kwargs.*eps must be a number"),
-    (
-        {"overrides": {"policy_kwargs": {"features_extractor_kwargs": {"n_layer": 2}}}},
-        r"policy_kwargs\.features_extractor_kwargs: unknown key 'n_layer', nearest known key: 'n_layers'",
-    ),
-    (
-        {"overrides": {"policy_kwargs": {"features_extractor_class": "mlp", "features_extractor_kwargs": {"n_filters": 2}}}},
-        "features_extractor_kwargs: unknown key 'n_filters'",
-    ),
-    (
-        {"overrides": {"policy_kwargs": {"features_extractor_class": "identity", "features_extractor_kwargs": {"width": 2}}}},
-        "unknown key 'width', there are none here",
-    ),
-    ({"overrides": {"batch_size": "many"}}, "batch_size must be an integer, not 'many'"),
-    ({"overrides": {"learning_rate": "lin_1e-3"}}, "learning_rate must be a number, not 'lin_1e-3'"),
-    ({"overrides": {"aux_loss": "no-such-loss"}}, "no-such-loss"),
-    ({"overrides": {"seed": 3}}, "unknown key 'seed'"),
-    ({"overrides": {"n_envs": 0}}, "n_envs must be at least 1, not 0"),
-    ({"overrides": {"n_envs": 1.5}}, "n_envs must be an integer"),
-    ({"overrides": {"env_kwargs": {"action_repeat": 0}}}, "overrides: action_repeat must be at least 1, not 0"),
-    (
-        {"overrides": {"policy_kwargs": {"features_extractor_class": "dens_mlp"}}},
-        "overrides: .*unknown encoder 'dens_mlp'.*dense_mlp",
-    ),
-    ({"overrides": {"vec_env": "threads"}}, "vec_env must be one of dummy, subproc, not 'threads'"),
-    ({"overrides": {"device": "gpu"}}, "overrides: device must be auto, cpu, cuda or cuda:N, not 'gpu'"),
-    ({"environment": 3}, "environment must be text, not 3"),
-    ({"environment": "dm_control/cheetah-rum-v0"}, "cheetah-run"),
-    ({"environment": "cheetah-run"}, "dm_control/cheetah-run-v0"),
-    ({"environment": "os:Pendulum-v1"}, "unknown environment"),
-    ({"hyperparameters": "missing.yml"}, "missing.yml"),
+    ({"populaton_size": 3}, "populaton_size: unknown key, .*'population_size'"),
+    ({"path": "x"}, "path: unknown key"),
+    ({"stages": 3}, "stages: .*'generations'"),
+    ({"cross_validation": {"environments": ["Pendulum-v1"], "sedes": [1]}}, "cross_validation.sedes: .*'seeds'"),
+    ({"cross_validation": {}}, "cross_validation.environments: is missing"),
+    ({"baselines": [{"name": "a", "aux_los": None}]}, r"baselines\[0\].aux_los: .*'aux_loss'"),
+    ({"baselines": [{"name": "a", "aux_loss": "curll"}]}, r"baselines\[0\].aux_loss: .*nearest: curl"),
+    ({"baselines": [{"name": "a"}, {"name": "a"}]}, "baselines: must be one or more different"),
+    ({"initial": ["curll"]}, "initial: .*nearest: curl"),
+    ({"initial": ["curl"]}, "mean squared error"),  # which is all that is searched without `operators`
+    ({"initial": "missing.yml"}, "initial: .*missing.yml: cannot be read"),
+    ({"imports": ["no_such_module"]}, "imports: no_such_module cannot be imported"),
+    ({"environment": 3}, "environment: should be a valid string, not 3"),
+    ({"environment": "dm_control/cheetah-rum-v0"}, "environment: unknown environment .*cheetah-run"),
+    ({"environment": "os:Pendulum-v1"}, "environment: unknown environment"),
+    ({"hyperparameters": "missing.yml"}, "missing.yml: cannot be read: No such file"),
     ({"hyperparameters": "."}, "cannot be read"),
-    ({"checkpoints": 5}, "checkpoints must be a list of an integer, not 5"),
-    ({"checkpoints": []}, "checkpoints"),
-    ({"checkpoints": [800, 400]}, "checkpoints must be positive environment steps in ascending order"),
-    ({"checkpoints": [401]}, "multiples of .*cheetah-run.*action repeat 4"),
-    ({"checkpoints": [400, 1.5]}, r"checkpoints\[1\] must be an integer, not 1.5"),
-    ({"stages": True}, "stages must be an integer, not True"),
-    ({"stages": 0}, "stages"),
-    ({"parents": float("nan")}, "parents must be a number"),
-    ({"parents": 2.0}, "parents"),
+    ({"checkpoints": 5}, "checkpoints: should be a list, not 5"),
+    ({"checkpoints": []}, r"checkpoints: .*not \[\]"),
+    ({"checkpoints": [800, 400]}, "checkpoints: must be environment steps in ascending order"),
+    ({"checkpoints": [0, 400]}, r"checkpoints\[0\]: should be greater than 0"),
+    ({"checkpoints": [401]}, r"checkpoints: must be multiples of 4 .*cheetah-run-v0.*\[401\] are not"),
+    ({"checkpoints": [402], "overrides": {"n_envs": 3, "env_kwargs": {"action_repeat": 2}}}, None),
+    ({"checkpoints": [404], "overrides": {"n_envs": 3, "env_kwargs": {"action_repeat": 2}}}, "multiples of 6"),
+    ({"checkpoints": [400, 1.5]}, r"checkpoints\[1\]: should be a valid integer, not 1.5"),
+    ({"generations": True}, "generations: should be a valid integer, not True"),
+    ({"generations": 0}, "generations: should be greater than 0"),
+    ({"retries": -1}, "retries"),
+    ({"threads": 0}, "threads"),
+    ({"parents": float("nan")}, "parents"),
+    ({"parents": 2.0}, r"parents must be a share in \(0, 1\]"),
     ({"random": 0.9}, "sum to 1"),
     ({"population_size": 0}, "population_size"),
+    ({"seeds": []}, r"seeds: .*not \[\]"),
+    ({"n_random": 0, "n_prior": 0}, "n_random"),
     ({"operators": ["mse", "huber"]}, "huber"),
-    ({"operators": "mse"}, "operators"),
-    ({"pruner": "medain"}, "pruner.*median"),
-    ({"seeds": [1, 1]}, "seeds"),
-    ({"seeds": []}, "seeds"),
-    ({"seeds": [-1]}, "seeds"),
+    ({"operators": "mse"}, "operators: should be a list"),
+    ({"pruner": "medain"}, "pruner: should be .*'median'"),
+    ({"seeds": [1, 1]}, "seeds: must be one or more different"),
+    ({"seeds": [-1]}, r"seeds\[0\]"),
+    ({"seeds": [2**32]}, r"seeds\[0\]"),
     ({"evaluation_episodes": 0}, "evaluation_episodes"),
-    ({"allow_duplicates": "no!"}, "allow_duplicates must be true or false"),
-    ({"cross_validation": {"environments": ["Pendulum-v1"], "top": 0}}, "top"),
+    ({"allow_duplicates": "no!"}, "allow_duplicates: should be a valid boolean, not 'no!'"),
+    ({"cross_validation": {"environments": ["Pendulum-v1"], "top": 0}}, "cross_validation.top"),
     ({"cross_validation": {"environments": []}}, "cross_validation.environments"),
-    ({"cross_validation": {"environments": ["Pendulum"]}}, "cross_validation.environments.*Pendulum-v1"),
-    ({"cross_validation": {"environments": ["Pendulum-v1"], "checkpoints": {"Pendulum-v1": [3]}}}, "multiples of Pendulum"),
+    ({"cross_validation": {"environments": ["Pendulum"]}}, r"cross_validation.environments\[0\]: .*Pendulum-v1"),
+    ({"cross_validation": {"environments": ["Pendulum-v1"], "checkpoints": {"Pendulum-v1": [3]}}}, "multiples of 4"),
+    ({"overrides": {"bach_size": 3}}, "overrides: bach_size: unknown key, .*'batch_size'"),
+    ({"overrides": {"seed": 3}}, "overrides: seed: unknown key"),
+    ({"overrides": {"env_kwargs": {"action_repeats": 2}}}, "env_kwargs.action_repeats: .*'action_repeat'"),
+    ({"overrides": {"env_kwargs": {"action_repeat": 0}}}, "env_kwargs.action_repeat: should be greater than 0"),
+    ({"overrides": {"policy_kwargs": {"net_arc": [2]}}}, "policy_kwargs.net_arc: .*'net_arch'"),
+    ({"overrides": {"policy_kwargs": 3}}, "policy_kwargs: should be a mapping, not 3"),
+    ({"overrides": {"replay_buffer_kwargs": {"frame_stacks": 2}}}, "replay_buffer_kwargs.frame_stacks: .*'frame_stack'"),
+    ({"overrides": {"replay_buffer_kwargs": {"n_envs": 2}}}, "replay_buffer_kwargs.n_envs: unknown key"),
+    ({"overrides": {"policy_kwargs": {"optimizer_kwargs": {"epss": 1e-5}}}}, "policy_kwargs.optimizer_kwargs.epss: .*'eps'"),
     (
-        {"cross_validation": {"environments": ["Pendulum-v1"], "checkpoints": {"MountainCarContinuous-v0": [5]}}},
-        "checkpoints: 'MountainCarContinuous-v0' is not trained on",
+        {"overrides": {"policy_kwargs": {"optimizer_kwargs": {"eps": "small"}}}},
+        "optimizer_kwargs.eps: should be a valid number",
     ),
+    (
+        {"overrides": {"policy_kwargs": {"features_extractor_kwargs": {"n_layer": 2}}}},
+        "extractor_kwargs.n_layer: .*'n_layers'",
+    ),
+    ({"overrides": {"policy_kwargs": {"features_extractor_class": "dens_mlp"}}}, "features_extractor_class: .*'dense_mlp'"),
+    ({"overrides": {"normalize": {"norm_obz": True}}}, "normalize.norm_obz: .*'norm_obs'"),
+    ({"overrides": {"normalize": 3}}, "normalize: should be a valid boolean, not 3"),
+    ({"overrides": {"policy": "MlpLstmPolicy"}}, "policy: should be 'MlpPolicy'"),
+    ({"overrides": {"batch_size": "many"}}, "batch_size: should be a valid integer, not 'many'"),
+    ({"overrides": {"learning_rate": "lin_1e-3"}}, "learning_rate: should be a valid number, not 'lin_1e-3'"),
+    ({"overrides": {"aux_loss": "no-such-loss"}}, "aux_loss: .*no-such-loss"),
+    ({"overrides": {"n_envs": 0}}, "n_envs: should be greater than 0"),
+    ({"overrides": {"n_envs": 1.5}}, "n_envs: should be a valid integer"),
+    ({"overrides": {"vec_env": "threads"}}, "vec_env: should be 'dummy' or 'subproc', not 'threads'"),
 ]
 
 
 @pytest.mark.parametrize(("change", "message"), WRONG, ids=[str(change)[:60] for change, _ in WRONG])
-def test_one_clear_line_for_what_is_wrong(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_one_clear_line_for_a_problem(tmp_path: Path, change: dict[str, Any], message: str | None) -> None:
     path = write(tmp_path, CONFIG | change)
+    if message is None:
+        load_config(path)
+        return
     with pytest.raises(ConfigError) as error:
         load_config(path)
     text = str(error.value)
@@ -263,64 +392,90 @@ def test_one_clear_line_for_what_is_wrong(tmp_path: Path, change: dict[str, Any]
     assert str(tmp_path) in text  # which file
 
 
-@pytest.mark.parametrize("key", ["environment", "hyperparameters", "checkpoints"])
-def test_what_is_missing_is_named(tmp_path: Path, key: str) -> None:
+def test_every_problem_has_a_line(tmp_path: Path) -> None:
+    path = write(tmp_path, CONFIG | {"checkpoints": [8, 4], "seds": [1], "cross_validation": {"environments": ["x"], "to": 1}})
+    with pytest.raises(ConfigError) as error:
+        load_config(path)
+    keys = ["checkpoints", "cross_validation.environments[0]", "cross_validation.to", "seds"]
+    assert [line.split(": ")[:2] for line in str(error.value).splitlines()] == [[str(path), key] for key in keys]
+
+
+@pytest.mark.parametrize("encoder", ["mlp", "identity"])
+def test_arguments_of_an_encoder_are_those_of_the_one_that_is_chosen(encoder: str) -> None:
+    policy_kwargs = {"features_extractor_class": encoder, "features_extractor_kwargs": {"width": 2, "n_filters": 2}}
+    with pytest.raises(ConfigError) as error:
+        check_hyperparameters({"policy_kwargs": policy_kwargs}, "Pendulum-v1", "here")
+    refused = [line.split(": ")[1].rpartition(".")[2] for line in str(error.value).splitlines()]
+    assert refused == (["n_filters"] if encoder == "mlp" else ["width", "n_filters"])
+
+
+def test_arguments_of_an_environment_are_those_of_its_wrapper() -> None:
+    values = {"env_kwargs": {"image_size": 84}}
+    assert check_hyperparameters(values, "dm_control/cheetah-run-v0", "here") == values
+    with pytest.raises(ConfigError, match=r"env_kwargs.image_size: unknown key"):
+        check_hyperparameters(values, "Pendulum-v1", "here")
+
+
+@pytest.mark.parametrize("key", CONFIG)
+def test_a_missing_key_is_named(tmp_path: Path, key: str) -> None:
     path = write(tmp_path, {name: value for name, value in CONFIG.items() if name != key})
-    with pytest.raises(ConfigError, match=f"{key} is missing"):
+    with pytest.raises(ConfigError, match=rf"search.yml: {key}: is missing$"):
         load_config(path)
 
 
+def test_an_environment_without_an_entry_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path, hyper={"Pendulum-v1": {}})
+    with pytest.raises(ConfigError, match=r"hyper.yml: neither 'dm_control/cheetah-run-v0' nor 'default'"):
+        load_config(path)
+    with pytest.raises(ConfigError, match=r"hyper.yml: default must be a mapping"):
+        load_config(write(tmp_path, hyper={"default": 3}))
+
+
 @pytest.mark.parametrize(
-    "text",
+    ("text", "problem"),
     [
-        "!!python/object/apply:os.system ['touch {marker}']",
-        "overrides: !!python/object/apply:subprocess.check_call [[touch, '{marker}']]",
-        "overrides: !!python/name:os.system",
-        "overrides: {{learning_starts: !!python/object/new:os.system ['touch {marker}']}}",
-        "overrides: {{learning_rate: \"__import__('os').system('touch {marker}')\"}}",
-        "stages: 2020-13-45",
-        "stages: !!int ''",
-        "stages: !!timestamp x",
-        "overrides: {{n_timesteps: 2020-01-01}}",
-        "overrides: !!binary aGVsbG8=",
-        "overrides: !!set {{a, b}}",
-        "1: 2",
-        "[a, b]",
-        "just text",
-        "",
-        "stages: 1\nstages: 2",
-        "a: &a [*a]",
-        "a: &a {{b: *a}}",
-        "a: &a [1,1,1,1,1,1,1,1,1,1]\nb: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a,*a]\nc: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b,*b]\n"
-        "d: &d [*c,*c,*c,*c,*c,*c,*c,*c,*c,*c]\ne: [*d,*d,*d,*d,*d,*d,*d,*d,*d,*d]",
-        "[" * 5000,
-        "stages: " + "9" * 5000,
-        "\x00",
-        "{{a: b",
+        ("a: [1", "line 1"),
+        ("a: 1\nb: {c: 2\nd: 3", "line 3"),
+        ("a: 1\n b: 2", "line 2"),
+        ("a: 1\nb: {c: 1, c: 2}", "line 2: 'c' is there twice"),
+        ("a: &x {b: 1}\n<<: *x\n<<: *x", None),
+        ("a: &x {b: 1, c: 1}\nd: {<<: *x, b: 2}", None),  # a merge is overwritten, as YAML has it
+        ("", "must hold a mapping"),
+        ("- a", "must hold a mapping"),
+        ("a: 2020-13-45", "month"),
+        ("!!python/object/apply:os.system ['touch {marker}']", "line 1"),
+        ("a: !!python/object/apply:subprocess.check_call [[touch, '{marker}']]", "line 1"),
+        ("a: !!python/name:os.system", "line 1"),
+        ("a: !!python/object/new:os.system ['touch {marker}']", "line 1"),
     ],
 )
-def test_files_that_are_not_plain_are_refused_and_execute_nothing(tmp_path: Path, text: str) -> None:
-    marker = tmp_path / "executed"
-    text = text.format(marker=marker)
-    files = [(text, HYPER), (CONFIG, text), *([(yaml.safe_dump(CONFIG) + text, HYPER)] if text else [])]
-    for config, hyper in files:
-        path = write(tmp_path, config, hyper)
-        with pytest.raises(ConfigError) as error:
-            load_config(path)
-        assert "\n" not in str(error.value) and len(str(error.value)) < 1000
+def test_files_that_are_not_plain_are_refused_and_evaluate_nothing(tmp_path: Path, text: str, problem: str | None) -> None:
+    path, marker = tmp_path / "file.yml", tmp_path / "evaluated"
+    path.write_text(text.replace("{marker}", str(marker)))
+    if problem is None:
+        assert read_yaml(path)
+        return
+    with pytest.raises(ConfigError, match=f"file.yml: .*{problem}") as error:
+        read_yaml(path)
+    assert "\n" not in str(error.value)
     assert not marker.exists()
 
 
-def test_auto_is_a_loss_of_hyperparameters(tmp_path: Path) -> None:
-    path = write(tmp_path, CONFIG, {"default": {"aux_loss": "auto"}})
-    load_config(path)
-    assert load_hyperparameters(tmp_path / "hyper.yml", "Pendulum-v1") == {"aux_loss": "auto"}
+def test_text_is_not_evaluated(tmp_path: Path) -> None:
+    """As RL-Zoo does with its files."""
+    code = f"__import__('pathlib').Path({str(tmp_path / 'evaluated')!r}).touch()"
+    for key in ("learning_rate", "policy", "policy_kwargs", "env_kwargs", "ent_coef", "tensorboard_log"):
+        try:
+            check_hyperparameters({key: code}, "Pendulum-v1", "here")
+        except ConfigError:
+            assert key not in ("ent_coef", "tensorboard_log")  # which may be text
+    assert not (tmp_path / "evaluated").exists()
 
 
 def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path)
-    path.write_bytes(b"\xff\xfe\x00stages: 1")
-    with pytest.raises(ConfigError):
+    path.write_bytes(b"\xff\xfe\x00generations: 1")
+    with pytest.raises(ConfigError, match=r"search.yml"):
         load_config(path)
 
 
@@ -329,29 +484,19 @@ plain = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=10), inner, max_size=3),
     max_leaves=8,
 )
-keys = st.sampled_from([name for name in SearchConfig.__dataclass_fields__ if name != "path"]) | st.text(max_size=12)
+keys = st.sampled_from([name for name in SearchConfig.model_fields if name not in ("path", "imports")]) | st.text(max_size=12)
 hyper_keys = st.sampled_from(
-    ["batch_size", "learning_rate", "policy", "env_kwargs", "policy_kwargs", "train_freq", "aux_loss"]
+    ["batch_size", "learning_rate", "policy", "env_kwargs", "policy_kwargs", "train_freq", "aux_loss", "normalize"]
 )
 
 
 @given(st.dictionaries(keys, plain, max_size=4), st.dictionaries(hyper_keys, plain, max_size=3))
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_plain_values_are_read_or_refused(tmp_path: Path, change: dict[str, Any], hyper: dict[str, Any]) -> None:
     path = write(tmp_path, CONFIG | change, {"default": HYPER["default"] | hyper})
     try:
         config = load_config(path)
     except ConfigError as error:
-        assert "\n" not in str(error)
+        assert str(tmp_path) in str(error)
     else:
         assert isinstance(config, SearchConfig)
-
-
-@given(st.text(alphabet=st.sampled_from(list("ab:-[]{}&*!<'\"#|>%@ \n\t0123.e~,?\\")), max_size=40))
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_text_is_read_or_refused(tmp_path: Path, text: str) -> None:
-    path = write(tmp_path, yaml.safe_dump(CONFIG) + text)
-    try:
-        load_config(path)
-    except ConfigError as error:
-        assert "\n" not in str(error)

@@ -26,14 +26,14 @@ from search.training.run import checkpoint_interval
 
 
 def _ascending(steps: tuple[int, ...]) -> tuple[int, ...]:
-    if list(steps) != sorted(set(steps)):
+    if not steps or list(steps) != sorted(set(steps)):
         raise ValueError(f"must be environment steps in ascending order, not {list(steps)}")
     return steps
 
 
 def _different(items: tuple[Any, ...]) -> tuple[Any, ...]:
-    if len(set(items)) < len(items):
-        raise ValueError(f"must be different, not {list(items)}")
+    if not items or len(set(items)) < len(items):
+        raise ValueError(f"must be one or more different ones, not {list(items)}")
     return items
 
 
@@ -50,9 +50,9 @@ def _loss_or_none(value: Any) -> AuxLoss | None:
 
 
 Environment = Annotated[str, AfterValidator(training.resolve_env_id)]
-Environments = Annotated[tuple[Environment, ...], Field(min_length=1), AfterValidator(_different)]
-Seeds = Annotated[tuple[Annotated[int, Field(ge=0, lt=2**32)], ...], Field(min_length=1), AfterValidator(_different)]
-Checkpoints = Annotated[tuple[PositiveInt, ...], Field(min_length=1), AfterValidator(_ascending)]
+Environments = Annotated[tuple[Environment, ...], AfterValidator(_different)]
+Seeds = Annotated[tuple[Annotated[int, Field(ge=0, lt=2**32)], ...], AfterValidator(_different)]
+Checkpoints = Annotated[tuple[PositiveInt, ...], AfterValidator(_ascending)]
 
 
 class CrossValidation(BaseModel, frozen=True, extra="forbid"):
@@ -175,7 +175,8 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     @field_validator("baselines")
     @classmethod
     def _names_differ(cls, baselines: tuple[Baseline, ...]) -> tuple[Baseline, ...]:
-        _different(tuple(baseline.name for baseline in baselines))
+        if baselines:
+            _different(tuple(baseline.name for baseline in baselines))
         return baselines
 
     @property
