@@ -1,12 +1,12 @@
 """AuxLossSampler: the paper's evolution of auxiliary losses (section 2.2, A.3) as a sampler of Optuna."""
 
-import contextlib
+import json
 import logging
 import math
 import threading
 import zlib
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,45 +16,27 @@ from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution import mutations, space
-from search.evolution.space import MAX_HORIZON, check_operators, loss_of
-from search.evolution.surrogate import TokenModel
+from search.evolution import space
+from search.evolution.candidates import Candidates, Result
 
 logger = logging.getLogger(__name__)
 
-# System attributes: of a trial, its slot and its loss, written in one piece; of a study, the sampler's settings and seed.
+# System attributes: of a trial, its slot and loss in one piece; of a study, the settings of its sampler.
 SLOT_KEY = "AuxLossSampler:slot"
 SETTINGS_KEY = "AuxLossSampler:settings"
 # Optuna's: what study.enqueue_trial was given.
 FIXED_KEY = "fixed_params"
-# Draws for one slot before a duplicate is accepted: only very small spaces run out of new losses.
-MAX_DRAWS = 300
-
-Slot = tuple[int, int]  # generation and slot
-
-
-class Candidate(NamedTuple):
-    """
-    A loss for one slot.
-
-    :param loss: The loss
-    :param operation: ``given``, ``random``, ``prior``, ``replacement``, ``crossover`` or ``horizon_change``
-    :param parents: Numbers of the trials that it stems from
-    """
-
-    loss: AuxLoss
-    operation: str
-    parents: tuple[int, ...] = ()
+# Settings that a study keeps. n_generations is not among them: a search may be continued.
+SETTINGS = (
+    *("population_size", "n_random", "n_prior", "parents", "replacement", "crossover", "horizon_change", "random"),
+    *("max_horizon", "operators", "allow_duplicates", "screening", "initial"),
+)
+# Threads of study.optimize share a sampler.
+LOCK = threading.Lock()
 
 
 class GenerationProgress(NamedTuple):
-    """
-    :param generation: Number of the generation, from 1
-    :param slots: How many slots it has
-    :param filled: Slots with a complete or pruned trial
-    :param running: Slots that are not filled and have a trial that runs
-    :param failed: Failed trials so far, without the interrupted ones
-    """
+    """How many slots a generation has, and how many are filled or have a running trial; how many trials have failed."""
 
     generation: int
     slots: int
@@ -68,18 +50,17 @@ class AuxLossSampler(BaseSampler):
     Evolution of auxiliary losses with the paper's mutations, for ``suggest_aux_loss``.
 
     The first generation (the paper's "stage") has the losses of ``initial``, ``n_random`` random ones and ``n_prior`` from two
-    priors. Each later one takes the best ``parents`` of the one before and fills its ``population_size`` slots in fixed shares:
-    ``random``, ``replacement``, ``crossover``, ``horizon_change``. It is over when every slot has a complete or pruned trial. The
-    random slots of the next one need no parents and come while the last trials of this one run.
+    priors. Each later one takes the best ``parents`` of the one before and fills its ``population_size`` slots in fixed
+    shares. It is over when every slot has a complete or pruned trial; the random slots of the next one come before that.
 
-    Each trial gets its slot when it is asked for, and shows it as user attributes: ``generation``, ``slot``, ``attempt``,
-    ``operation``, ``parents``. Its loss depends on the seed, the slot and the generations before only, not on how many trials run
-    at once. A failed trial frees its slot for another candidate; one with the user attribute ``interrupted`` for the same one.
-    An enqueued trial takes a random slot if there is one.
+    A trial gets its slot when it is asked for, and shows it in its user attributes ``generation``, ``slot``, ``attempt``,
+    ``operation`` and ``parents``. Its loss depends on the seed, the slot and earlier generations, not on the number of trials
+    that run at once. A failed trial frees its slot for another candidate, or for the same one if it has the user attribute
+    ``interrupted``. An enqueued trial takes a random slot if there is one.
 
-    Asking never waits. Where no slot is free, a trial gets one more offspring of the last parents, in a slot behind all
-    others, and counts in its generation if it finishes before that is over. Trials of a program that was killed stay RUNNING and
-    hold their slots: report ``TrialState.FAIL`` for them.
+    Asking never waits. A trial that finds no free slot gets one more offspring of the last parents and a slot number behind
+    all others; it counts if it finishes before its generation is over. Trials of a killed program stay RUNNING and hold their
+    slots: report ``TrialState.FAIL`` for them.
 
     :param population_size: Slots of every generation but the first (paper: 100)
     :param n_random: Random losses of the first generation (paper: 100)
@@ -112,7 +93,7 @@ class AuxLossSampler(BaseSampler):
         crossover: float = 0.2,
         horizon_change: float = 0.1,
         random: float = 0.2,
-        max_horizon: int = MAX_HORIZON,
+        max_horizon: int = space.MAX_HORIZON,
         operators: Sequence[str] | None = None,
         allow_duplicates: bool = False,
         seed: int | None = None,
@@ -120,86 +101,64 @@ class AuxLossSampler(BaseSampler):
         n_generations: int | None = None,
         initial: Sequence[AuxLoss] = (),
     ):
-        positive = {"population_size": population_size, "max_horizon": max_horizon, "screening": screening}
-        positive |= {"n_random + n_prior + initial": n_random + n_prior + len(initial)}
-        for name, count in {**positive, "n_generations": 1 if n_generations is None else n_generations}.items():
-            if count < 1:
-                raise ValueError(f"{name} must be at least 1, not {count}")
-        # Random slots come first: they need no parents.
-        shares = {"random": random, "replacement": replacement, "crossover": crossover, "horizon_change": horizon_change}
-        for name, number in {**shares, "n_random": n_random, "n_prior": n_prior, "seed": seed or 0}.items():
-            if not 0 <= number < math.inf:
-                raise ValueError(f"{name} must not be negative, not {number}")
-        if abs(sum(shares.values()) - 1) > 1e-9:
-            raise ValueError(f"the shares {', '.join(shares)} must sum to 1, not {sum(shares.values())}")
-        if not 0 < parents <= 1:
-            raise ValueError(f"parents must be a share in (0, 1], not {parents}")
-        check_operators(operators)
+        self.population_size = population_size
+        self.n_random = n_random
+        self.n_prior = n_prior
+        self.parents = parents
+        self.replacement = replacement
+        self.crossover = crossover
+        self.horizon_change = horizon_change
+        self.random = random
         self.max_horizon = max_horizon
         self.operators = None if operators is None else tuple(operators)
-        for loss in initial:
-            space.loss_to_params(loss, self.operators)
-            if loss.horizon > max_horizon:
-                raise ValueError(f"initial has {loss}, whose horizon is longer than {max_horizon}")
-        self.parents = parents
         self.allow_duplicates = allow_duplicates
         self.seed = seed
         self.screening = screening
         self.n_generations = n_generations
         self.initial = tuple(initial if allow_duplicates else {loss.canonical(): loss for loss in initial}.values())
-        self.settings: dict[str, Any] = {
-            "population_size": population_size,
-            "n_random": n_random,
-            "n_prior": n_prior,
-            "parents": parents,
-            **shares,
-            "max_horizon": max_horizon,
-            "operators": None if operators is None else list(operators),
-            "allow_duplicates": allow_duplicates,
-            "screening": screening,
-            "initial": [str(loss) for loss in self.initial],
-        }
-        self._first_operations = ["given"] * len(self.initial) + ["random"] * n_random + ["prior"] * n_prior
-        slots = _apportion(shares, population_size)
-        self._operations = [name for name in shares for _ in range(slots[name])]
-        self._forget()
+        self._check_arguments()
+        # Operations of all slots. Random ones come first in later generations: they need no parents.
+        self._first = ["given"] * len(self.initial) + ["random"] * n_random + ["prior"] * n_prior
+        shares = {"random": random, "replacement": replacement, "crossover": crossover, "horizon_change": horizon_change}
+        self._later = [name for name, count in _apportion(shares, population_size).items() for _ in range(count)]
+        self._cached: tuple[Any, int, _Slots] | None = None  # storage, study and what is known of its slots
 
-    def _forget(self) -> None:
-        self._lock = threading.Lock()
-        self._cached: tuple[Any, int, _Evolution] | None = None  # storage, study and what is known of it
+    def _check_arguments(self) -> None:
+        positive = {name: getattr(self, name) for name in ("population_size", "max_horizon", "screening", "n_generations")}
+        positive["n_random + n_prior + initial"] = self.n_random + self.n_prior + len(self.initial)
+        for name, number in positive.items():
+            if number is not None and number < 1:
+                raise ValueError(f"{name} must be at least 1, not {number}")
+        shares = {name: getattr(self, name) for name in ("random", "replacement", "crossover", "horizon_change")}
+        for name, number in {**shares, "n_random": self.n_random, "n_prior": self.n_prior, "seed": self.seed}.items():
+            if number is not None and not number >= 0:
+                raise ValueError(f"{name} must not be negative, not {number}")
+        if abs(sum(shares.values()) - 1) > 1e-9:
+            raise ValueError(f"the shares {', '.join(shares)} must sum to 1, not {sum(shares.values())}")
+        if not 0 < self.parents <= 1:
+            raise ValueError(f"parents must be a share in (0, 1], not {self.parents}")
+        space.check_operators(self.operators)
+        for loss in self.initial:
+            space.loss_to_params(loss, self.operators)
+            if loss.horizon > self.max_horizon:
+                raise ValueError(f"initial has {loss}, whose horizon is longer than {self.max_horizon}")
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("_lock", "_cached")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._forget()
+        return {**self.__dict__, "_cached": None}
 
     def operations(self, generation: int) -> list[str]:
-        """
-        The operation of every slot of a generation.
-
-        :param generation: Number of the generation, from 1
-        """
-        return self._first_operations if generation == 1 else self._operations
+        """The operation of every slot of a generation."""
+        return self._first if generation == 1 else self._later
 
     def free_slots(self, study: Study) -> int:
-        """
-        How many trials that are asked for now would get a slot; 0 when the last generation is over.
-
-        :param study: The study
-        """
-        with self._lock:
-            return len(self._refresh(study).free_slots())
+        """How many trials that are asked for now would get a slot; 0 when the last generation is over."""
+        with LOCK:
+            return len(self._refresh(study).free())
 
     def is_complete(self, study: Study) -> bool:
-        """
-        Whether the last of ``n_generations`` is over.
-
-        :param study: The study
-        """
-        with self._lock:
-            return self._refresh(study).generation > (self.n_generations or math.inf)
+        """Whether the last of ``n_generations`` is over."""
+        with LOCK:
+            return self._refresh(study).candidates.generation > (self.n_generations or math.inf)
 
     def stop_when_complete(self, study: Study, trial: FrozenTrial) -> None:
         """A callback for ``study.optimize`` that ends it after the last generation."""
@@ -207,29 +166,25 @@ class AuxLossSampler(BaseSampler):
             study.stop()
 
     def progress(self, study: Study) -> list[GenerationProgress]:
-        """
-        How far each generation is that has started, or all of them where ``n_generations`` is known.
-
-        :param study: The study
-        """
-        with self._lock:
-            evolution = self._refresh(study)
-            return [evolution.progress(number) for number in range(1, (self.n_generations or evolution.last_started) + 1)]
+        """How far each generation is that has started, or all of them where ``n_generations`` is known."""
+        with LOCK:
+            slots = self._refresh(study)
+            return [slots.progress(number) for number in range(1, 1 + (self.n_generations or slots.last_started))]
 
     # Optuna's interface.
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
         if SLOT_KEY in trial.system_attrs:
-            return  # Optuna's copy of a trial whose heartbeat stopped keeps its slot.
-        with self._lock:
-            evolution = self._refresh(study)
-            system = evolution.assign(trial.number, trial.system_attrs.get(FIXED_KEY, trial.params or None))
-            for key, value in system.items():
+            return  # Optuna's copy of a trial whose heartbeat stopped
+        with LOCK:
+            slots = self._refresh(study)
+            assigned = slots.assign(trial.number, trial.system_attrs.get(FIXED_KEY, trial.params or None))
+            for key, value in assigned.items():
                 study._storage.set_trial_system_attr(trial._trial_id, key, value)
-        trial.system_attrs.update(system)
-        for name in ("generation", "slot", "attempt", "operation", "parents"):
-            study._storage.set_trial_user_attr(trial._trial_id, name, system[SLOT_KEY][name])
-            trial.user_attrs[name] = system[SLOT_KEY][name]
+        trial.system_attrs.update(assigned)
+        for key in ("generation", "slot", "attempt", "operation", "parents"):
+            study._storage.set_trial_user_attr(trial._trial_id, key, assigned[SLOT_KEY][key])
+            trial.user_attrs[key] = assigned[SLOT_KEY][key]
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         return space.distributions(self.max_horizon, self.max_horizon, self.operators)
@@ -242,29 +197,30 @@ class AuxLossSampler(BaseSampler):
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
         """What the user searches beside the loss is drawn at random, as a function of the slot like the loss itself."""
-        slot = trial.system_attrs[SLOT_KEY]
-        key = [slot["seed"], slot["generation"], slot["slot"], slot["attempt"], zlib.crc32(param_name.encode())]
+        assigned = trial.system_attrs[SLOT_KEY]
+        key = [assigned[name] for name in ("seed", "generation", "slot", "attempt")] + [zlib.crc32(param_name.encode())]
         sampler = RandomSampler(int(np.random.SeedSequence(key).generate_state(1)[0]))
         return sampler.sample_independent(study, trial, param_name, param_distribution)
 
-    def _refresh(self, study: Study) -> "_Evolution":
+    def _refresh(self, study: Study) -> "_Slots":
         storage, study_id = study._storage, study._study_id
         # Not study.get_trials: under a HyperbandPruner the study shows one bracket only.
         trials = storage.get_all_trials(study_id, deepcopy=False)
         if self._cached is None or self._cached[:2] != (storage, study_id) or len(trials) < self._cached[2].n_trials:
             sign = 1.0 if study.direction == StudyDirection.MAXIMIZE else -1.0
-            self._cached = (storage, study_id, _Evolution(self, self._check_settings(study), sign))
+            self._cached = storage, study_id, _Slots(self, self._study_seed(study), sign)
         self._cached[2].refresh(trials)
         return self._cached[2]
 
-    def _check_settings(self, study: Study) -> int:
-        """Refuse a study that was started with other settings: its slots mean something else. Returns its seed."""
+    def _study_seed(self, study: Study) -> int:
+        """The seed of a study. One that was started with other settings is refused: its slots mean something else."""
+        settings = json.loads(json.dumps({name: getattr(self, name) for name in SETTINGS}, default=str))
         stored = study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY)
         if stored is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0]) if self.seed is None else self.seed
-            stored = {**self.settings, "seed": seed}
+            stored = {**settings, "seed": seed}
             study._storage.set_study_system_attr(study._study_id, SETTINGS_KEY, stored)
-        for name, value in self.settings.items():
+        for name, value in settings.items():
             if stored.get(name) != value:
                 raise ValueError(f"this study was started with {name}={stored.get(name)!r}, not {value!r}: use another study")
         if self.seed not in (None, stored["seed"]):
@@ -272,81 +228,49 @@ class AuxLossSampler(BaseSampler):
         return stored["seed"]
 
 
-class _Result(NamedTuple):
-    """The finished trial of a slot."""
-
-    number: int
-    loss: AuxLoss
-    score: float  # higher is better
-    fitness: float  # the same, minus infinity where the trial was pruned or its score is not finite
-
-
-class _Evolution:
+class _Slots:
     """
-    What is known of one study: the trials that its slots have, and the candidates of the slots.
+    The trials of a study by their slots, as far as the storage shows them.
 
-    Candidates are planned in rounds. Round g starts when generation g - 1 is over. It has the slots of generation g that need
-    parents (in the first one all), and then the random ones of generation g + 1. It knows nothing of its own results, so that
-    its plan does not depend on the order in which trials finish.
-
-    :param sampler: Its settings
+    :param sampler: The settings
     :param seed: Seed of the study
     :param sign: -1 where scores are minimized
     """
 
     def __init__(self, sampler: AuxLossSampler, seed: int, sign: float):
         self.sampler = sampler
-        self.seed = seed
+        self.candidates = Candidates(sampler, seed)
+        self.last = sampler.n_generations or math.inf
         self.sign = sign
         self.n_trials = 0
         self.unfinished: list[int] = []  # numbers of trials
-        self.running: set[Slot] = set()
-        # Of each generation and slot, the first finished trial; None if it has no loss.
-        self.results: defaultdict[int, dict[int, _Result | None]] = defaultdict(dict)
-        self.failed: Counter[Slot] = Counter()
-        self.interrupted: dict[Slot, FrozenTrial] = {}  # the last trial of a slot, if it was interrupted
-        self.generation = 1  # the first one that is not over
         self.last_started = 1
-        # First candidates of slots: those that the storage has already, and all that are known.
-        self.stored: dict[Slot, dict[str, Any]] = {}
-        self.plan: dict[Slot, Candidate] = {}
-        self.to_plan = deque(self._round())
-        # Canonical forms in the order in which they came, and how many there were at the end of each round.
-        self.seen: dict[AuxLoss, int] = {}
-        self.n_seen: dict[int, int] = {}
-        self.model = TokenModel(sampler.max_horizon)
-        # Of the last generation that is over: all results, those of them that are parents, and those that may be crossed.
-        self.population: list[_Result] = []
-        self.parents: list[_Result] = []
-        self.crossed: list[_Result] = []
-
-    # Slots.
+        self.running: set[tuple[int, int]] = set()  # generation and slot
+        self.results: defaultdict[int, dict[int, Result | None]] = defaultdict(dict)  # None where a trial has no loss
+        self.failed: Counter[tuple[int, int]] = Counter()
+        self.interrupted: dict[tuple[int, int], FrozenTrial] = {}  # the last trial of a slot, if it was interrupted
 
     def refresh(self, trials: Sequence[FrozenTrial]) -> None:
         """Look at the trials that are new or were not finished before, in the order in which they finished."""
-        numbers = (*self.unfinished, *range(self.n_trials, len(trials)))
-        with_slot = [(trial, trial.system_attrs.get(SLOT_KEY)) for trial in (trials[number] for number in numbers)]
+        changed = [trials[number] for number in (*self.unfinished, *range(self.n_trials, len(trials)))]
         self.n_trials = len(trials)
-        self.unfinished = [trial.number for trial, _ in with_slot if not trial.state.is_finished()]
+        self.unfinished = [trial.number for trial in changed if not trial.state.is_finished()]
         self.running.clear()
         finished = []
-        for trial, assigned in with_slot:
-            if assigned is None:
-                continue
-            slot = assigned["generation"], assigned["slot"]
-            self.last_started = max(self.last_started, assigned["generation"])
-            if assigned["attempt"] == 0 and assigned["operation"] != "enqueued":
-                self.stored.setdefault(slot, assigned)
-            if trial.state.is_finished():
-                finished.append((trial.datetime_complete, trial.number, slot))
-            else:
-                self.running.add(slot)
-        for _, number, slot in sorted(finished):
-            self._finish(*slot, trials[number])
+        for trial in changed:
+            if SLOT_KEY in trial.system_attrs:
+                at = trial.system_attrs[SLOT_KEY]["generation"], trial.system_attrs[SLOT_KEY]["slot"]
+                self.last_started = max(self.last_started, at[0])
+                if trial.state.is_finished():
+                    finished.append((trial.datetime_complete, trial.number, at))
+                else:
+                    self.running.add(at)
+        for _, number, at in sorted(finished):
+            self._finish(trials[number], *at)
 
-    def _finish(self, generation: int, slot: int, trial: FrozenTrial) -> None:
+    def _finish(self, trial: FrozenTrial, generation: int, slot: int) -> None:
         self.interrupted.pop((generation, slot), None)
-        loss = loss_of(trial)
+        loss = space.loss_of(trial)
         if trial.state == TrialState.FAIL:
             if trial.user_attrs.get("interrupted"):
                 self.interrupted[generation, slot] = trial
@@ -355,24 +279,29 @@ class _Evolution:
         elif trial.state == TrialState.COMPLETE or loss is not None:  # what was pruned as invalid fills no slot
             score = math.nan if trial.value is None else self.sign * trial.value
             is_fit = trial.state == TrialState.COMPLETE and math.isfinite(score)
-            result = None if loss is None else _Result(trial.number, loss, score, score if is_fit else -math.inf)
-            if generation >= self.generation:  # else its slot, and the choice of parents, is settled
+            result = None if loss is None else Result(trial.number, loss, score, score if is_fit else -math.inf)
+            if generation >= self.candidates.generation:  # else the choice of parents is settled
                 self.results[generation].setdefault(slot, result)
-            while all(slot in self.results[self.generation] for slot in range(self._size(self.generation))):
-                self._end_generation()
+            while not self._open(self.candidates.generation):
+                of_generation = sorted(self.results[self.candidates.generation].items())
+                self.candidates.end_generation([result for _, result in of_generation if result is not None])
 
-    def free_slots(self) -> list[Slot]:
+    def _open(self, generation: int) -> list[int]:
+        """Slots without a result."""
+        return [slot for slot in range(len(self.sampler.operations(generation))) if slot not in self.results[generation]]
+
+    def free(self) -> list[tuple[int, int]]:
         """Slots of this generation without a trial, and random ones of the next."""
-        last = self.sampler.n_generations or self.generation + 1
-        slots = [(self.generation, slot) for slot in range(self._size(self.generation))] + self._round()
-        slots = [slot for slot in dict.fromkeys(slots) if slot[0] <= last]
-        return [slot for slot in slots if slot not in self.running and slot[1] not in self.results[slot[0]]]
+        now = self.candidates.generation
+        early = [slot for slot in self._open(now + 1) if self.sampler.operations(now + 1)[slot] == "random"]
+        slots = [(now, slot) for slot in self._open(now)] + [(now + 1, slot) for slot in early]
+        return [at for at in slots if at[0] <= self.last and at not in self.running]
 
     def progress(self, generation: int) -> GenerationProgress:
-        slots = {(generation, slot) for slot in range(self._size(generation))}
-        filled = {(generation, slot) for slot in self.results.get(generation, ())} & slots
-        failed = sum(number for slot, number in self.failed.items() if slot[0] == generation)
-        return GenerationProgress(generation, len(slots), len(filled), len((slots & self.running) - filled), failed)
+        size, unfilled = len(self.sampler.operations(generation)), self._open(generation)
+        running = sum((generation, slot) in self.running for slot in unfilled)
+        failed = sum(number for (of, _), number in self.failed.items() if of == generation)
+        return GenerationProgress(generation, size, size - len(unfilled), running, failed)
 
     def assign(self, number: int, given: Mapping[str, Any] | None) -> dict[str, Any]:
         """
@@ -381,168 +310,22 @@ class _Evolution:
         :param number: Number of the trial
         :param given: Parameters that were enqueued, None if it was not
         """
-        free = self.free_slots()
+        free = self.free()
         if given is not None:  # no offspring is lost, if that can be
-            free.sort(key=lambda slot: (slot in self.interrupted, self._operation(*slot) != "random"))
+            free.sort(key=lambda at: (at in self.interrupted, self.sampler.operations(at[0])[at[1]] != "random"))
         if not free:
-            generation = min(self.generation, self.sampler.n_generations or self.generation)
-            free = [(generation, self._size(generation) + number)]
-            logger.info("Trial %d is one more of generation %d: trials %s hold its slots", number, generation, self.unfinished)
+            generation = int(min(self.candidates.generation, self.last))
+            free = [(generation, len(self.sampler.operations(generation)) + number)]
+            logger.warning("Trial %d is one more of generation %d: %s hold its slots", number, generation, self.unfinished)
         (generation, slot), attempt = free[0], self.failed[free[0]]
-        key = {"seed": self.seed, "generation": generation, "slot": slot, "attempt": attempt}
+        key = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
         if given is not None:
-            loss = self._complete(given, np.random.default_rng(list(key.values())))
+            loss = self.candidates.with_given(given, list(key.values()))
             return {SLOT_KEY: {**key, "operation": "enqueued", "parents": [], "loss": loss and str(loss)}}
-        if interrupted := self.interrupted.get((generation, slot)):
-            return {name: interrupted.system_attrs[name] for name in (SLOT_KEY, FIXED_KEY) if name in interrupted.system_attrs}
-        candidate = self._candidate(generation, slot, attempt)
-        drawn = {"operation": candidate.operation, "parents": list(candidate.parents), "loss": str(candidate.loss)}
-        return {SLOT_KEY: {**key, **drawn}}
-
-    def _complete(self, given: Mapping[str, Any], rng: np.random.Generator) -> AuxLoss | None:
-        """A loss with all given parameters, the others at random; None if there is no valid one."""
-        operators = self.sampler.operators
-        for _ in range(MAX_DRAWS):
-            drawn = space.loss_to_params(space.random_loss(rng, self.sampler.max_horizon, operators), operators)
-            with contextlib.suppress(KeyError, TypeError, ValueError):
-                loss = space.params_to_loss({**drawn, **given})
-                space.loss_to_params(loss, operators)
-                return loss
-        return None
-
-    # Candidates.
-
-    def _size(self, generation: int) -> int:
-        return len(self.sampler.operations(generation))
-
-    def _operation(self, generation: int, slot: int) -> str:
-        operations = self.sampler.operations(generation)
-        if slot < len(operations):
-            return operations[slot]
-        return "random" if generation == 1 else operations[slot % len(operations)]
-
-    def _round_of(self, generation: int, slot: int) -> int:
-        return generation - (generation > 1 and self._operation(generation, slot) == "random")
-
-    def _round(self) -> list[Slot]:
-        """Slots of this round, in the order in which they are planned."""
-        slots = [(number, slot) for number in (self.generation, self.generation + 1) for slot in range(self._size(number))]
-        return [slot for slot in slots if self._round_of(*slot) == self.generation]
-
-    def _plan_next(self) -> None:
-        slot = self.to_plan[0]
-        if stored := self.stored.get(slot):
-            candidate = Candidate(AuxLoss.parse(stored["loss"]), stored["operation"], tuple(stored["parents"]))
-        else:
-            candidate = self._draw(*slot, 0, lambda form: form in self.seen)
-        self.plan[slot] = candidate
-        self.seen.setdefault(candidate.loss.canonical(), len(self.seen))
-        self.to_plan.popleft()
-        if not self.to_plan:
-            self.n_seen[self.generation] = len(self.seen)
-
-    def _end_generation(self) -> None:
-        """Choose parents, and start the next round."""
-        while self.to_plan:
-            self._plan_next()
-        results = [result for _, result in sorted(self.results[self.generation].items()) if result is not None]
-        for result in results:
-            self.seen.setdefault(result.loss.canonical(), len(self.seen))
-        if self.sampler.screening > 1:
-            self.model.add([result.loss for result in results], [result.score for result in results])
-        # Equal ones in the order of their slots.
-        best = sorted(results, key=lambda result: -result.fitness)[: max(1, round(self.sampler.parents * len(results)))]
-        self.population, self.parents = results, best
-        self.crossed = [one for one in best if _partners(one, best)] or [one for one in best if _partners(one, results)]
-        self.generation += 1
-        self.to_plan.extend(self._round())
-
-    def _candidate(self, generation: int, slot: int, attempt: int) -> Candidate:
-        """
-        The candidate of a slot.
-
-        :param generation: Number of the generation, from 1
-        :param slot: Number of the slot, from 0
-        :param attempt: How many candidates of this slot failed
-        """
-        in_plan = slot < self._size(generation)
-        if in_plan and attempt == 0:
-            while (generation, slot) not in self.plan:
-                self._plan_next()
-            # And two of what comes next, so that the rest of a round need not be planned all at once at its end.
-            for _ in range(min(2, len(self.to_plan))):
-                self._plan_next()
-            return self.plan[generation, slot]
-        round_number = self._round_of(generation, slot)
-        while in_plan and self.to_plan and round_number == self.generation:
-            self._plan_next()
-        # Known is what was planned until the end of the round: the same before and after a generation ends meanwhile.
-        n_seen = self.n_seen[round_number] if in_plan else len(self.seen)
-        before: set[AuxLoss] = set()  # attempts
-        for number in range(min(1, attempt), attempt + 1):
-            candidate = self._draw(
-                generation, slot, number, lambda form: form in before or self.seen.get(form, n_seen) < n_seen
-            )
-            before.add(candidate.loss.canonical())
-        return candidate
-
-    def _draw(self, generation: int, slot: int, attempt: int, is_known: Callable[[AuxLoss], bool]) -> Candidate:
-        rng = np.random.default_rng([self.seed, generation, slot, attempt])
-        operation = self._operation(generation, slot)
-        if operation == "given":
-            if attempt == 0:
-                return Candidate(self.sampler.initial[slot], operation)
-            operation = "random"
-        # What replaces a failed random loss has to be the same before and after the model learns of another generation.
-        is_screened = self.sampler.screening > 1 and self.model.n_trials and not (attempt and operation == "random")
-        offspring: dict[AuxLoss, Candidate] = {}  # of different canonical forms
-        for _ in range(self.sampler.screening if is_screened else 1):
-            candidate = self._draw_new(rng, operation, slot, is_known)
-            offspring.setdefault(candidate.loss.canonical(), candidate)
-        return list(offspring.values())[self.model.best(list(offspring), self.model.draw(rng)) if is_screened else 0]
-
-    def _draw_new(self, rng: np.random.Generator, operation: str, slot: int, is_known: Callable[[AuxLoss], bool]) -> Candidate:
-        """One offspring, redrawn while it is invalid or known."""
-        candidate = None
-        for _ in range(MAX_DRAWS):
-            try:
-                candidate = self._offspring(rng, operation, slot)
-            except mutations.RejectedLoss:
-                continue
-            if self.sampler.allow_duplicates or not is_known(candidate.loss.canonical()):
-                return candidate
-        if operation in ("crossover", "horizon_change"):
-            # No pair of one horizon, two parents that are almost equal, a space of one horizon.
-            return self._draw_new(rng, "replacement", slot, is_known)
-        if candidate is None:
-            raise RuntimeError(f"no valid loss in {MAX_DRAWS} draws by {operation}")
-        logger.info("No new loss in %d draws by %s: %s repeats one", MAX_DRAWS, operation, candidate.loss)
-        return candidate
-
-    def _offspring(self, rng: np.random.Generator, operation: str, slot: int) -> Candidate:
-        sampler = self.sampler
-        if operation == "random":
-            return Candidate(space.random_loss(rng, sampler.max_horizon, sampler.operators), operation)
-        if operation == "prior":
-            prior = space.PRIORS[slot % len(space.PRIORS)]
-            return Candidate(prior(rng, sampler.max_horizon, sampler.operators), operation)
-        if not self.parents:
-            raise RuntimeError("no trial of the last generation has a loss: the objective has to call suggest_aux_loss")
-        mothers = self.crossed if operation == "crossover" else self.parents
-        if not mothers:
-            raise mutations.RejectedLoss("no parent has another candidate of its horizon")
-        mother = mothers[rng.integers(len(mothers))]
-        if operation == "replacement":
-            return Candidate(mutations.replacement(mother.loss, rng, sampler.operators), operation, (mother.number,))
-        if operation == "horizon_change":
-            return Candidate(mutations.horizon_change(mother.loss, rng, sampler.max_horizon), operation, (mother.number,))
-        partners = _partners(mother, self.parents) or _partners(mother, self.population)
-        father = partners[rng.integers(len(partners))]
-        return Candidate(mutations.crossover(mother.loss, father.loss, rng), operation, (mother.number, father.number))
-
-
-def _partners(one: _Result, results: Iterable[_Result]) -> list[_Result]:
-    return [other for other in results if other.number != one.number and other.loss.horizon == one.loss.horizon]
+        if again := self.interrupted.get(free[0]):
+            return {name: value for name, value in again.system_attrs.items() if name in (SLOT_KEY, FIXED_KEY)}
+        loss, operation, parents = self.candidates.of_slot(generation, slot, attempt)
+        return {SLOT_KEY: {**key, "operation": operation, "parents": list(parents), "loss": str(loss)}}
 
 
 def _apportion(shares: dict[str, float], total: int) -> dict[str, int]:

@@ -89,7 +89,7 @@ def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
     """
     The loss of a trial's parameters.
 
-    :param params: As :func:`loss_to_params` gives them; others are passed over
+    :param params: As :func:`loss_to_params` returns them; others are ignored
     :raises KeyError: when parameters are missing
     :raises ValueError: when the loss is not valid
     """
@@ -117,39 +117,37 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
     :param trial: The trial
     :param max_horizon: Longest horizon of the space
     :param operators: Operators to search too, with and without negatives; None for mean squared error without
-    :raises optuna.TrialPruned: when the sampler proposes what is not valid; nothing was trained then
-    :raises ValueError: when AuxLossSampler searches a larger space, or other operators
+    :raises optuna.TrialPruned: when what the sampler proposes, or a user enqueued, is not valid; nothing was trained then
+    :raises ValueError: when AuxLossSampler searches longer horizons, or other operators
     """
     check_operators(operators)
-    # Optuna would draw anew what does not fit, and train another loss than the sampler took note of.
-    sampler = getattr(getattr(trial, "study", None), "sampler", None)
-    longest = getattr(sampler, "max_horizon", max_horizon)
-    given = None if operators is None else tuple(operators)
-    for name, value, searched in (
-        ("max_horizon", max_horizon, max(max_horizon, longest)),
-        ("operators", given, getattr(sampler, "operators", given)),
-    ):
-        if searched != value:
-            raise ValueError(f"the sampler searches with {name}={searched!r}, suggest_aux_loss asks for {name}={value!r}")
-    name, params = "horizon", dict[str, Any]()
-    choices: Sequence[Any] = range(1, max_horizon + 1)
-    try:
-        horizon = params[name] = trial.suggest_int(name, 1, max_horizon)
-        if not 1 <= horizon <= longest:  # Optuna only warns of an enqueued one
-            raise optuna.TrialPruned(f"horizon must be between 1 and {longest}, not {horizon}")
-        for name, distribution in distributions(horizon, max_horizon, operators).items():
-            if isinstance(distribution, CategoricalDistribution):
-                choices = distribution.choices
-                params[name] = trial.suggest_categorical(name, choices)
-    except (TypeError, ValueError) as error:
-        enqueued = getattr(trial, "_fixed_params", {})  # anything may be
-        if name in enqueued and enqueued[name] not in choices:
-            raise optuna.TrialPruned(f"{name} was enqueued with a value that it cannot have: {error}") from None
-        raise
+    names = None if operators is None else tuple(operators)
+    study: optuna.Study | None = getattr(trial, "study", None)  # a FixedTrial has none
+    longest = max_horizon
+    if study is not None:
+        longest = getattr(study.sampler, "max_horizon", max_horizon)
+        # Optuna would redraw what does not fit, and train another loss than the sampler recorded.
+        if longest > max_horizon or getattr(study.sampler, "operators", names) != names:
+            searched = f"max_horizon={longest} and operators={getattr(study.sampler, 'operators', names)}"
+            raise ValueError(f"the sampler searches {searched}, not max_horizon={max_horizon} and operators={names}")
+        _check_enqueued(study.get_trials(deepcopy=False)[trial.number], longest, operators)
+    params: dict[str, Any] = {"horizon": trial.suggest_int("horizon", 1, max_horizon)}
+    for name, distribution in distributions(params["horizon"], max_horizon, operators).items():
+        if isinstance(distribution, CategoricalDistribution):
+            params[name] = trial.suggest_categorical(name, distribution.choices)
     try:
         return params_to_loss(params)
     except ValueError as error:
         raise optuna.TrialPruned(str(error)) from None
+
+
+def _check_enqueued(trial: FrozenTrial, max_horizon: int, operators: Sequence[str] | None) -> None:
+    """Optuna raises for some values that a parameter cannot have, and only warns of others."""
+    enqueued = trial.system_attrs.get("fixed_params", {})
+    for name, distribution in distributions(max_horizon, max_horizon, operators).items():
+        choices = getattr(distribution, "choices", range(1, max_horizon + 1))
+        if name in enqueued and enqueued[name] not in choices:
+            raise optuna.TrialPruned(f"{name} was enqueued as {enqueued[name]!r}, it must be one of {list(choices)}")
 
 
 def random_operator(rng: np.random.Generator, operators: Sequence[str] | None) -> tuple[str, bool]:

@@ -1,6 +1,5 @@
 """A Bayesian linear model of what each token of a loss is worth, for screening offspring before they are trained."""
 
-import threading
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,16 +10,14 @@ from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
 # Of a score: such as -sys.float_info.max, which stands for a failure.
 LARGEST = 1e100
-# The matrices are too small for threads, which would wait for each other where trainings have the cores. The limit is the
-# whole process's: two fits at once might leave it behind.
+# The matrices are too small for threads: where runs have the cores, a fit with several takes a second, with one 16 ms.
 BLAS = ThreadpoolController()
-FITTING = threading.Lock()
 
 
 def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
     """
-    What the model sees of losses, of their canonical forms: the bits of both masks, how many states, actions and rewards
-    each has (so that tokens of one kind share what they have in common), the horizon, the operator and negatives.
+    The bits of both masks of the canonical forms, the number of states, actions and rewards of each mask (so that tokens of
+    one kind share what they have in common), horizon, operator and negatives.
 
     :param losses: The losses
     :param max_horizon: Longest horizon of the space
@@ -39,10 +36,9 @@ class TokenModel:
     """
     scikit-learn's BayesianRidge on sums over all trials, so that a fit costs the same however many there were.
 
-    A Bayesian ridge regression depends on its data only through their number and their centred second moments. It is
-    fitted to a square root of these, as many rows as there are features, and told of the rows that are missing
-    through its prior: ``alpha_1`` enters the noise precision exactly like half a row. Scores are standardised first, so
-    that the choice does not depend on their unit.
+    A Bayesian ridge regression depends on its data only through their number and their centred second moments. It is fitted to
+    a square root of these, as many rows as there are features; the missing rows come in through its prior, as ``alpha_1``
+    enters the noise precision exactly like half a row. Scores are standardised first, so that their unit does not matter.
 
     :param max_horizon: Longest horizon of the space
     """
@@ -63,13 +59,13 @@ class TokenModel:
         Add finished trials and fit again.
 
         :param losses: Their losses
-        :param values: Their scores, higher is better; those that are not finite, or too large to be squared, are passed over
+        :param values: Their scores, higher is better; those that are not finite, or too large to be squared, are skipped
         """
         finite = np.abs(values) < LARGEST
         if not finite.any():
             return
         rows = np.column_stack([features(losses, self.max_horizon), values])[finite]
-        with FITTING, BLAS.limit(limits=1, user_api="blas"):
+        with BLAS.limit(limits=1, user_api="blas"):
             shift = rows.mean(axis=0) - self.means
             deviations = rows - rows.mean(axis=0)
             weight = len(rows) / (self.n_trials + len(rows))
@@ -109,6 +105,6 @@ class TokenModel:
         """
         :param losses: Losses to choose from
         :param weights: A draw of :meth:`draw`
-        :return: The place of the one that the weights rate highest
+        :return: Index of the one that the weights rate highest
         """
         return int(np.argmax(features(losses, self.max_horizon) @ weights))
