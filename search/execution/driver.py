@@ -131,10 +131,10 @@ class Driver:
         try:
             self._patiently(self._interrupt_unknown)
             while True:
-                while self._has_room() and self._patiently(self.sampler.free_slots, self.study) > 0:
-                    self._start(self._patiently(self._ask))
                 for candidate in list(self.candidates.values()):
                     self._check(candidate)
+                while self._has_room() and self._patiently(self.sampler.free_slots, self.study) > 0:
+                    self._start(self._patiently(self._ask))
                 yield self._patiently(self._progress)
                 if not self.candidates and self._patiently(self.sampler.is_complete, self.study):
                     return
