@@ -1,9 +1,9 @@
 """Tables of a benchmark: the paper's numbers, means, deviations, intervals and marks, and what is missing."""
 
+import io
 import itertools
 import json
 import math
-import re
 import shutil
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -13,15 +13,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
 from scipy import stats
-from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import Evaluation, write_curve
 from sb3_aarl.envs import env_ids
-from search.cli.main import app
-from search.execution.matrix import Cell
+from search.execution.matrix import Cell, cell_folder
 from search.results import table
-from search.studies.benchmark import run_folder
 from search.training.provenance import ABOUT
 
 # The paper's tables as its text has them; table 3 and the first part of table 4 have the asterisks and daggers left out.
@@ -74,8 +72,6 @@ normalized | 0.919 ± 0.217 | 0.544 ± 0.360 | 1.000 ± 0.129 | 0.813 ± 0.218
 """,
 }
 CHEETAH, WALKER, FISH = (f"dm_control/{task}-v0" for task in ("cheetah-run", "walker-walk", "fish-upright"))
-# A narrow terminal must not cut numbers.
-runner = CliRunner(env={"COLUMNS": "60", "TERM": "dumb"})
 
 
 def environment_id(task: str) -> str:
@@ -119,15 +115,26 @@ def test_the_table_with_the_most_variants_is_shown(variants: list[str], number: 
     assert table.closest_table(variants) == number
 
 
-def plant(folder: Path, cell: Cell, curve: Mapping[int, float], checkpoints: Sequence[int] = (100_000,), **about: Any) -> None:
+def plant(folder: Path, cell: Cell, curve: Mapping[int, float], checkpoints: Sequence[int] = (100_000,), **about: Any) -> Path:
     """A run as a benchmark leaves it."""
-    path = run_folder(folder, cell)
+    path = cell_folder(folder, cell)
     path.mkdir(parents=True)
     if curve:
         write_curve(path / "curve.csv", [Evaluation(steps, mean, 1.0, 10, 2.0) for steps, mean in curve.items()])
     session = {"commit": "c0ffee"}
     values = {**cell._asdict(), "checkpoints": list(checkpoints), "sessions": [session], **about}
     (path / ABOUT).write_text(json.dumps(values))
+    return path
+
+
+def printed(folder: Path, number: int | None = None) -> str:
+    """All that is shown of a benchmark, in one line with single spaces."""
+    number, runs, comparison, iqm, better = table.read_tables(folder, number)
+    console = Console(width=1000, record=True, file=io.StringIO())
+    for shown in [*table.score_tables(comparison), *table.statistics_tables(iqm, better)]:
+        console.print(shown)
+    lines = [*table.footnotes(number, comparison, iqm, better), *table.missing(runs), *table.mixed(runs)]
+    return " ".join([*console.export_text().split(), *lines])
 
 
 def plant_scores(folder: Path, scores: Mapping[tuple[str, str], np.ndarray]) -> None:
@@ -159,7 +166,7 @@ def test_means_deviations_and_marks(tmp_path: Path) -> None:
         row = result.loc[(environment, variant)]
         mean, std, _ = paper.loc[(environment, variant), ["mean", "std", "runs"]]
         welch = stats.ttest_ind_from_stats(of_seeds.mean(), of_seeds.std(ddof=1), 10, mean, std, 10, equal_var=False)
-        assert (row["asked"], row["runs"], row["paper_mean"], row["paper_std"]) == (10, 10, mean, std)
+        assert (row["planned"], row["runs"], row["paper_mean"], row["paper_std"]) == (10, 10, mean, std)
         assert row["mean"] == pytest.approx(of_seeds.mean()) and row["std"] == pytest.approx(of_seeds.std(ddof=1))
         assert row["difference"] / row["standard_error"] == pytest.approx(welch.statistic)
         assert row["mark"] == ("higher" if welch.statistic > 2 else "lower" if welch.statistic < -2 else "")
@@ -205,7 +212,7 @@ def test_interquartile_means_and_their_intervals_are_those_of_rliable(planted: p
         assert row["iqm"] == pytest.approx(iqm) == pytest.approx(stats.trim_mean(planted_matrices()[variant].ravel(), 0.25))
         assert (row["low"], row["high"]) == pytest.approx((low, high), abs=0.5)
         n_runs = planted_matrices()[variant].size
-        assert (row["tasks"], row["n_tasks"], row["asked"], row["runs"]) == ("DeepMind Control", 6, n_runs, n_runs)
+        assert (row["tasks"], row["n_tasks"], row["planned"], row["runs"]) == ("DeepMind Control", 6, n_runs, n_runs)
 
 
 def test_probabilities_of_improvement_are_those_of_rliable(planted: pd.DataFrame) -> None:
@@ -244,9 +251,9 @@ def test_statistics_are_over_tasks_of_one_scale_that_all_variants_have(tmp_path:
     better = table.improvements(runs).set_index(["variant", "over"])
     assert better.loc[("a", "b"), "probability"] == pytest.approx(np.mean([0.0, (0.5 + 1 + 0 + 1) / 4]))
     assert better.loc[("a", "b"), "n_tasks"] == 2
-    shown = runner.invoke(app, ["table", str(tmp_path)]).stdout
+    shown = printed(tmp_path)
     line = "At 100K not every variant has runs on walker-walk: interquartile means leave that out."
-    assert " ".join(shown.split()).count(line) == shown.count("not every variant") == 1
+    assert shown.count(line) == shown.count("not every variant") == 1
     assert "Each probability is over" not in shown
 
 
@@ -270,7 +277,7 @@ def test_each_probability_is_over_the_tasks_of_its_two_variants(tmp_path: Path) 
         ("c", "b"): 0.0,
     }
     assert better["n_tasks"].to_dict() == {pair: 2 if "c" not in pair else 1 for pair in better.index}
-    shown = " ".join(runner.invoke(app, ["table", str(tmp_path)]).stdout.split())
+    shown = printed(tmp_path)
     # Nobody but d was to be on Pendulum-v1, which is of another scale.
     assert "At 100K not every variant has runs on cheetah-run: interquartile" in shown and shown.count("not every") == 1
     assert shown.count("Each probability is over the tasks that both variants have runs on") == 1
@@ -298,20 +305,18 @@ def test_every_task_weighs_the_same_in_an_interquartile_mean(tmp_path: Path) -> 
         assert rows.loc[variant, "iqm"] == pytest.approx(stats.trim_mean(np.concatenate(matrix), 0.25))
         assert rows.loc[variant, "low"] < rows.loc[variant, "iqm"] < rows.loc[variant, "high"]
     assert rows["runs"].to_dict() == {"all": 20, "some": 6, "none": 0}
-    assert rows["asked"].to_dict() == {"all": 20, "some": 13, "none": 3}
+    assert rows["planned"].to_dict() == {"all": 20, "some": 13, "none": 3}
     assert rows.loc["none", ["iqm", "low", "high"]].isna().all()
-    shown = runner.invoke(app, ["table", str(tmp_path)])
-    assert shown.exit_code == 0 and re.search(r"none +│ - +│ - +│ 0/3 ", shown.stdout), shown.output
     assert rows["left_out"].to_dict() == {"all": 0, "some": 7, "none": 3}
-    assert "leave out the seeds that a variant has on some of the tasks only" in " ".join(shown.stdout.split())
+    shown = printed(tmp_path)
+    assert "│ none │ - │ - │ 0/3 │" in shown
+    assert "leave out the seeds that a variant has on some of the tasks only" in shown
 
 
 @pytest.mark.parametrize(("of_other", "says"), [([1.0, 2.0], True), ([1.0, 4.0], False), ([3.0, 5.0], False)])
 def test_intervals_without_width_are_explained(tmp_path: Path, of_other: list[float], says: bool) -> None:
     plant_scores(tmp_path, {("mine", CHEETAH): np.array([3.0, 5.0]), ("other", CHEETAH): np.array(of_other)})
-    shown = runner.invoke(app, ["table", str(tmp_path)])
-    assert shown.exit_code == 0, shown.output
-    text = " ".join(shown.stdout.split())
+    text = printed(tmp_path)
     assert ("An interval without width" in text) is says
     for n_runs, probability in ((2, "1/3"), (3, "1/10"), (5, "1/126")):
         together = stats.mannwhitneyu(range(n_runs), range(n_runs, 2 * n_runs), method="exact").pvalue
@@ -324,9 +329,7 @@ def test_one_run_has_neither_deviation_nor_interval_nor_mark(tmp_path: Path) -> 
     result = table.compare(runs, 4)
     assert result["std"].isna().all() and list(result["mark"]) == ["", ""] and list(result["mean"]) == [1.0, 999.0]
     assert table.interquartile_means(runs)[["low", "high"]].isna().all(axis=None)
-    shown = runner.invoke(app, ["table", str(tmp_path)])
-    assert shown.exit_code == 0, shown.stderr
-    assert "│ cheetah-run │          1 │ 472 ± 30 │" in shown.stdout
+    assert "│ cheetah-run │ 1 │ 472 ± 30 │" in printed(tmp_path)
 
 
 def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
@@ -337,7 +340,8 @@ def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
         "aarl_mlp_4": {CHEETAH: [100.0, 150.0], WALKER: [300.0]},  # a run is missing
     }
     plant_scores(tmp_path, {(v, e): np.array(scores) for v, of in returns.items() for e, scores in of.items()})
-    plant(tmp_path, Cell("aarl_mlp_4", WALKER, 1), {}, failed="it burst")
+    failed = plant(tmp_path, Cell("aarl_mlp_4", WALKER, 1), {})
+    (failed / "failed.json").write_text('{"reason": "it burst", "retry": true}')
     result = table.compare(table.read_runs(tmp_path), 6).set_index("variant")
     complete = ("aarl_state", "aarl_mlp_1", "aarl_dense_mlp_4")
     scale = {env: np.mean([returns[variant][env] for variant in complete]) for env in (CHEETAH, WALKER)}
@@ -346,22 +350,21 @@ def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
     for variant, scores in relative.items():
         row = result.loc[variant]
         assert (row["mean"], row["std"]) == pytest.approx((scores.mean() / best, scores.std(ddof=1) / best))
-        assert (row["environment"], row["asked"], row["runs"]) == ("normalized", 4, 4)
+        assert (row["environment"], row["planned"], row["runs"]) == ("normalized", 4, 4)
     assert result.loc["aarl_state", "mean"] == 1.0
-    assert math.isnan(result.loc["aarl_mlp_4", "mean"]) and tuple(result.loc["aarl_mlp_4", ["asked", "runs"]]) == (4, 3)
+    assert math.isnan(result.loc["aarl_mlp_4", "mean"]) and tuple(result.loc["aarl_mlp_4", ["planned", "runs"]]) == (4, 3)
     # Normalized by others than the paper's four: no number of the paper, no mark, and why.
     assert result[["paper_mean", "paper_std", "paper_runs", "difference"]].isna().all(axis=None) and set(result["mark"]) == {
         ""
     }
-    shown = " ".join(runner.invoke(app, ["table", str(tmp_path)]).stdout.split())
+    shown = printed(tmp_path)
     assert "100K steps scores, without the paper's: normalized by other variants than its four" in shown
     assert "1.000 ± 0.12" not in shown and "aarl_mlp_4 on walker-walk, seed 1: it burst" in shown
 
-    path = run_folder(tmp_path, Cell("aarl_mlp_4", WALKER, 1))
-    write_curve(path / "curve.csv", [Evaluation(100_000, 310.0, 1.0, 10, 2.0)])
+    write_curve(failed / "curve.csv", [Evaluation(100_000, 310.0, 1.0, 10, 2.0)])
     result = table.compare(table.read_runs(tmp_path), 6).set_index("variant")
     assert list(result["paper_runs"]) == [30] * 4 and result.loc["aarl_state", "paper_mean"] == 1.0 == result["mean"].max()
-    shown = " ".join(runner.invoke(app, ["table", str(tmp_path)]).stdout.split())
+    shown = printed(tmp_path)
     assert "1.000 ± 0.129" in shown and "without the paper's" not in shown
     plant(tmp_path, Cell("mine", CHEETAH, 0), {100_000: 900.0}, sessions=[])
     assert table.compare(table.read_runs(tmp_path), 6)["paper_mean"].count() == 4  # not complete: it normalizes nothing
@@ -387,35 +390,32 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
     for seed in range(3):
         plant(tmp_path, Cell("aarl_state", CHEETAH, seed), {100_000: 470.0 + seed, 500_000: 800.0 + seed}, steps)
         plant(tmp_path, Cell("sac_identity", CHEETAH, seed), {100_000: 200.0 + seed, 500_000: 300.0 + seed}, steps)
-    plant(tmp_path, Cell("aarl_state", CHEETAH, 3), {}, steps, failed="TrainingError: it burst")
+    failed = plant(tmp_path, Cell("aarl_state", CHEETAH, 3), {}, steps)
+    (failed / "failed.json").write_text('{"reason": "ExplodedError: it burst", "retry": false}')
     plant(tmp_path, Cell("aarl_state", CHEETAH, 4), {100_000: 480.0}, steps)
-    plant(tmp_path, Cell("aarl_state", CHEETAH, 5), {}, steps, sessions=[])
-    plant(tmp_path, Cell("aarl_state", CHEETAH, 6), {}, steps, sessions=[])
-    plant(tmp_path, Cell("aarl_state", CHEETAH, 7), {100_000: math.nan, 500_000: 9.0}, steps)
+    for seed in (5, 6):
+        plant(tmp_path, Cell("aarl_state", CHEETAH, seed), {}, steps, sessions=[])
     plant(tmp_path, Cell("mine", CHEETAH, 0), {}, steps, sessions=[{"commit": "c0ffee"}, {"commit": "beef"}])
-    result = table.compare(table.in_order(table.read_runs(tmp_path), 4), 4).set_index(["checkpoint", "variant"])
-    early = result.loc[(100_000, "aarl_state")]
-    assert (early["asked"], early["runs"], early["mean"]) == (8, 4, np.mean([470, 471, 472, 480]))
-    assert (result.loc[(100_000, "mine"), "asked"], result.loc[(100_000, "mine"), "runs"]) == (1, 0)
-    shown = runner.invoke(app, ["table", str(tmp_path), "--json", str(tmp_path / "data.json")])
-    assert shown.exit_code == 0, shown.stderr
-    assert "473 ± 5 (4/8)" in shown.stdout
-    lines = [line for line in shown.stdout.splitlines() if line.startswith("Missing")]
+    number, runs, comparison, iqm, better = table.read_tables(tmp_path)
+    row = comparison.set_index(["checkpoint", "variant"]).loc[(100_000, "aarl_state")]
+    assert (row["planned"], row["runs"], row["mean"]) == (7, 4, np.mean([470, 471, 472, 480]))
+    lines = table.missing(runs)
     assert lines == [
-        "Missing at 100,000: aarl_state on cheetah-run, seed 3: TrainingError: it burst",
-        "Missing at 100,000: aarl_state on cheetah-run, seeds 5, 6: not begun",
-        "Missing at 100,000: aarl_state on cheetah-run, seed 7: its return is nan",
+        "Missing at 100,000: aarl_state on cheetah-run, seed 3: ExplodedError: it burst",
+        "Missing at 100,000: aarl_state on cheetah-run, seeds 5, 6: not started",
         "Missing at 100,000: mine on cheetah-run, seed 0: unfinished, evaluated up to 0",
-        "Missing at 500,000: aarl_state on cheetah-run, seed 3: TrainingError: it burst",
+        "Missing at 500,000: aarl_state on cheetah-run, seed 3: ExplodedError: it burst",
         "Missing at 500,000: aarl_state on cheetah-run, seed 4: unfinished, evaluated up to 100,000",
-        "Missing at 500,000: aarl_state on cheetah-run, seeds 5, 6: not begun",
+        "Missing at 500,000: aarl_state on cheetah-run, seeds 5, 6: not started",
         "Missing at 500,000: mine on cheetah-run, seed 0: unfinished, evaluated up to 0",
     ]
-    assert json.loads((tmp_path / "data.json").read_text())["missing"] == lines
-    assert "Runs of several commits or versions: c0ffee (10); beef (1)" in shown.stdout
-    iqm = table.interquartile_means(table.read_runs(tmp_path)).set_index(["checkpoint", "variant"])
-    assert list(iqm.loc[100_000].index) == ["aarl_state", "sac_identity"]  # what has no run hides no others
-    assert tuple(iqm.loc[(100_000, "aarl_state"), ["asked", "runs"]]) == (8, 4) and "│ 4/8" in shown.stdout
+    assert table.as_data(number, comparison, iqm, better, runs)["missing"] == lines
+    early = iqm.set_index(["checkpoint", "variant"]).loc[100_000]
+    assert list(early.index) == ["aarl_state", "sac_identity"]  # a variant without any run hides no others
+    assert tuple(early.loc["aarl_state", ["planned", "runs"]]) == (7, 4)
+    shown = printed(tmp_path)
+    assert "473 ± 5 (4/7)" in shown and "│ 4/7 │" in shown
+    assert "Runs of several commits or versions: c0ffee (9); beef (1)" in shown
 
 
 def test_commits_and_versions_that_differ_are_counted_by_run(tmp_path: Path) -> None:
@@ -428,87 +428,46 @@ def test_commits_and_versions_that_differ_are_counted_by_run(tmp_path: Path) -> 
     assert table.commits(table.read_runs(tmp_path)) == {"c0ffee": 2, "torch 2.12": 2, "torch 2.13": 1}
 
 
-def test_a_run_that_is_there_twice_is_refused_with_both_folders(tmp_path: Path) -> None:
-    cell = Cell("a", CHEETAH, 0)
-    plant(tmp_path, cell, {100_000: 1.0})
-    first, copied = run_folder(tmp_path, cell), run_folder(tmp_path, cell._replace(seed=9))
-    shutil.copytree(first, copied)
-    for command in (["table"], ["figures", "curves"]):
-        result = runner.invoke(app, [*command, str(tmp_path)])
-        message = f"Error: {first} and {copied} have the same run: a on {CHEETAH}, seed 0"
-        assert result.exit_code == 2 and result.stderr == f"{message}\n"
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"hyperparameters": {"aux_loss": "auto", "gamma": 0.9}}, "gamma=0.5 and 0.9"),
-        ({"hyperparameters": {"aux_loss": None, "gamma": 0.5}}, "aux_loss='auto' and None"),
-        ({"evaluation_episodes": 1}, "evaluation_episodes=10 and 1"),
-        ({"hyperparameters": {"aux_loss": "auto", "gamma": 0.5, "n_timesteps": 9, "device": "cuda"}}, None),
-    ],
-    ids=str,
-)
-def test_seeds_that_were_trained_in_different_ways_are_refused(
-    changed: dict[str, Any], message: str | None, tmp_path: Path
-) -> None:
-    settings = {"hyperparameters": {"aux_loss": "auto", "gamma": 0.5}, "evaluation_episodes": 10}
-    cells = [Cell("a", CHEETAH, 0), Cell("a", CHEETAH, 1), Cell("a", WALKER, 0), Cell("b", CHEETAH, 0)]
-    for cell in cells:  # other variants and tasks have their own
-        plant(tmp_path, cell, {100_000: 1.0}, **(settings if cell == cells[0] else settings | changed))
-    if message is None:
-        assert len(table.read_runs(tmp_path)) == 4
-    else:
-        first, second = (run_folder(tmp_path, cell) for cell in cells[:2])
-        with pytest.raises(ValueError, match=re.escape(f"{first} and {second} cannot be compared: {message}")):
-            table.read_runs(tmp_path)
-
-
-def test_a_run_with_a_torn_description_is_missing(tmp_path: Path) -> None:
-    for seed in range(2):
-        plant(tmp_path, Cell("a", CHEETAH, seed), {100_000: 1.0})
-    (run_folder(tmp_path, Cell("a", CHEETAH, 1)) / ABOUT).write_text('{"variant": "a", "envir')
-    result = runner.invoke(app, ["table", str(tmp_path)])
-    assert result.exit_code == 0 and "1 (1/2)" in result.stdout
-    assert f"Missing at 100,000: a on cheetah-run, seed 1: its {ABOUT} cannot be read" in result.stdout
+def test_two_copies_of_a_run_are_refused(tmp_path: Path) -> None:
+    first = plant(tmp_path, Cell("a", CHEETAH, 0), {100_000: 1.0})
+    shutil.copytree(first, first.with_name("seed-9"))
+    with pytest.raises(ValueError, match=r"seed-0 and .*seed-9 have the same run: a on dm_control/cheetah-run-v0, seed 0"):
+        table.read_runs(tmp_path)
 
 
 def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) -> None:
-    plant_scores(
-        tmp_path, {("aarl_state", CHEETAH): np.array([430.0, 440.0]), ("curl_state", CHEETAH): np.array([189.0, 191.0])}
-    )
-    # Its variants first: the others are of no table.
-    options = ["--table", "4", "--csv", str(tmp_path / "scores.csv"), "--json", str(tmp_path / "data.json")]
-    shown = runner.invoke(app, ["table", str(tmp_path), *options])
-    assert shown.exit_code == 0, shown.stderr
-    rows = [[cell.strip() for cell in line.strip("│┃┡┩").split("│")] for line in shown.stdout.splitlines() if "│" in line]
-    (cheetah,) = (row for row in rows if row[0] == "cheetah-run" and "±" in row[1])
-    a, b = (matrix[:, 2] for matrix in planted_matrices().values())
-    own = [f"{scores.mean():.0f} ± {scores.std(ddof=1):.0f}" for scores in (a, b)]
-    assert cheetah[1:] == ["435 ± 7 ▼", "472 ± 30", "190 ± 1", "190 ± 32", *own]
-    assert shown.stdout.index("AARL-State") < shown.stdout.index("CURL")
-    assert "Paper: table 4." in shown.stdout and "[" not in shown.stdout.partition("Interquartile")[0]
-    runs = table.in_order(table.read_runs(tmp_path), 4)
-    comparison = table.compare(runs, 4)
-    written = pd.read_csv(tmp_path / "scores.csv", keep_default_na=True)
-    pd.testing.assert_frame_equal(written.fillna({"mark": ""}), comparison, check_dtype=False)
-    data = json.loads((tmp_path / "data.json").read_text())
+    ours = {("aarl_state", CHEETAH): np.array([430.0, 440.0]), ("curl_state", CHEETAH): np.array([189.0, 191.0])}
+    plant_scores(tmp_path, ours)
+    number, runs, comparison, iqm, better = table.read_tables(tmp_path)
+    own = [
+        f"{scores.mean():.0f} ± {scores.std(ddof=1):.0f}"
+        for scores in (matrix[:, 2] for matrix in planted_matrices().values())
+    ]
+    shown = printed(tmp_path)
+    assert f"│ cheetah-run │ 435 ± 7 ▼ │ 472 ± 30 │ 190 ± 1 │ 190 ± 32 │ {own[0]} │ {own[1]} │" in shown
+    assert shown.index("AARL-State") < shown.index("CURL") and "Paper: table 4." in shown
+    data = json.loads(json.dumps(table.as_data(number, comparison, iqm, better, runs)))
     assert data["table"] == 4 and data["missing"] == [] and data["commits"] == {"c0ffee": len(runs)}
-    frames = (("scores", comparison), ("improvements", table.improvements(runs)), ("runs", runs))
-    for name, frame in frames:
-        as_frame = pd.DataFrame(data[name], columns=list(frame.columns))
-        pd.testing.assert_frame_equal(as_frame.astype(frame.dtypes.to_dict()), frame, check_exact=False)
+    frames = {"scores": comparison, "improvements": better, "interquartile_means": iqm, "runs": runs}
+    for name, frame in frames.items():
+        same = pd.DataFrame(data[name], columns=list(frame.columns)).astype(frame.dtypes.to_dict())
+        pd.testing.assert_frame_equal(same, frame, check_exact=False)
 
 
 def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
-    result = runner.invoke(app, ["table", str(tmp_path)])
-    assert result.exit_code == 2 and result.stderr == f"Error: {tmp_path} has no runs of a benchmark\n"
+    with pytest.raises(ValueError, match="has no runs of a benchmark"):
+        table.read_tables(tmp_path)
 
 
-@pytest.mark.parametrize(("file", "content"), [(ABOUT, "{"), (ABOUT, "{}"), ("curve.csv", "steps\n1\n")], ids=str)
-def test_a_file_that_is_not_a_benchmarks_is_named(tmp_path: Path, file: str, content: str) -> None:
-    plant(tmp_path, Cell("mine", CHEETAH, 0), {100_000: 1.0})
-    path = run_folder(tmp_path, Cell("mine", CHEETAH, 0))
-    (path / file).write_text(content)
-    result = runner.invoke(app, ["table", str(tmp_path)])
-    assert result.exit_code == 2 and f"Error: {path} is not what a benchmark leaves" in result.stderr
+def test_runs_of_the_first_version_are_read() -> None:
+    """They have no run.json."""
+    folder = Path(__file__).parent.parent / "results" / "choices"
+    number, runs, comparison, _, _ = table.read_tables(folder)
+    assert number == 4 and runs["mean"].notna().all()
+    last = [pd.read_csv(path / "curve.csv")["mean"].iloc[-1] for path in (folder / "curl_state_bf16/cheetah-run").iterdir()]
+    row = comparison.set_index("variant").loc["curl_state_bf16"]
+    assert (row["mean"], row["std"], row["column"]) == (
+        pytest.approx(np.mean(last)),
+        pytest.approx(np.std(last, ddof=1)),
+        "CURL",
+    )

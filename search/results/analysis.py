@@ -13,7 +13,7 @@ from scipy.stats import ttest_ind
 from sklearn.ensemble import RandomForestRegressor
 
 from sb3_aarl import catalog
-from sb3_aarl.aux_loss import AuxLoss
+from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from search.evolution.space import loss_to_params
 from search.results.rankings import rank_agreement, rankings
 from search.results.trials import (
@@ -246,8 +246,8 @@ def importances(table: pd.DataFrame) -> pd.DataFrame:
     scores = trials["score"]
     if scores.nunique() < 2:
         raise ValueError(f"importances need different scores; there are {len(trials)} complete trials, all alike")
-    params = pd.DataFrame([loss_to_params(loss) for loss in trials["loss"]], index=trials.index)
-    tokens = params.drop(columns="horizon").eq(True)
+    params = pd.DataFrame([loss_to_params(loss, OPERATORS) for loss in trials["loss"]], index=trials.index)
+    tokens = params.drop(columns=["horizon", "operator", "negatives"]).eq(True)
     varied = [name for name in ("operator", "negatives") if trials[name].nunique() > 1]
     others = trials[["horizon", *varied]].apply(lambda column: column.astype("category").cat.codes)
     features = tokens.join(others)

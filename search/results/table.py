@@ -20,6 +20,7 @@ from search.execution.matrix import comparable, task_name
 from search.results.statistics import SUITE, are_common, improvements, interquartile_means, scale_of
 from search.studies import operator_selection
 from search.studies.benchmark import read_abouts
+from search.training.run import FAILED
 
 # A difference is marked from so many standard errors on.
 STANDARD_ERRORS = 2.0
@@ -97,7 +98,7 @@ def read_runs(folder: Path) -> pd.DataFrame:
         settings = (commits, versions, about.get("program", ""), about.get("evaluation_episodes", 0))
         for checkpoint in about["checkpoints"]:
             mean = returns.get(checkpoint, math.nan)
-            reason = "" if math.isfinite(mean) else _why_missing(about, checkpoint, returns)
+            reason = "" if math.isfinite(mean) else _why_missing(path, about, checkpoint, returns)
             cell = (about["variant"], about["environment"], about["seed"])
             rows.append((*cell, checkpoint, math.nan if reason else mean, reason, *settings))
     if not rows:
@@ -105,11 +106,12 @@ def read_runs(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=RUN_COLUMNS)
 
 
-def _why_missing(about: dict[str, Any], checkpoint: int, returns: dict[int, float]) -> str:
+def _why_missing(path: Path, about: dict[str, Any], checkpoint: int, returns: dict[int, float]) -> str:
     if checkpoint in returns:
         return f"the return is {returns[checkpoint]}"
-    started = f"unfinished, evaluated up to {max(returns, default=0):,}" if about["sessions"] else "not started"
-    return about.get("failed", started)
+    if (path / FAILED).exists():
+        return json.loads((path / FAILED).read_text(encoding="utf-8"))["reason"]
+    return f"unfinished, evaluated up to {max(returns, default=0):,}" if about["sessions"] else "not started"
 
 
 def in_order(runs: pd.DataFrame, number: int | None) -> pd.DataFrame:
@@ -156,7 +158,8 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     paper = paper.rename(columns={"variant": "paper_variant", "mean": numbers[0], "std": numbers[1], "runs": numbers[2]})
     paper = paper.drop(columns="column").astype(dict.fromkeys(numbers, float))
     result["paper_variant"] = result["variant"].map(paper_variant)
-    result["column"] = result["paper_variant"].map(headings).fillna(result["variant"])
+    names = zip(result["paper_variant"], result["variant"], strict=True)
+    result["column"] = [headings.get(name, variant) for name, variant in names]
     result = result.merge(paper, on=[*keys[:2], "paper_variant"], how="left")
     for _, part in result.groupby("checkpoint"):
         if not _is_comparable(part):
