@@ -1,8 +1,8 @@
 """
 Write README.md from the runs that lie beside it: every number of a run of ours comes from a curve.csv and its provenance.json.
 
-A folder here is what ``aarl benchmark`` leaves, without its storage and the checkpoints of unfinished runs. What is said of it
-stands in its about.md, the first line being its title; numbers do not belong there.
+A folder here is that of an ``aarl benchmark``, without the checkpoints of unfinished runs. Its text is its about.md, the first
+line being its title; numbers do not belong there.
 """
 
 import os
@@ -20,11 +20,11 @@ from search.studies.benchmark import read_abouts, task_name
 
 RESULTS = Path(__file__).parent
 ABOUT = "about.md"
-# The paper's search from states: seven stages on Cheetah-Run (table 12) of a population of 100, the first with 25 more of the
-# priors (A.3); the environment steps of a candidate there, and the GPU hours after which the paper stopped each of its own.
+# The paper's search from states: seven generations on Cheetah-Run (table 12) of a population of 100, the first with 25 more of
+# the priors (A.3); the environment steps of a candidate there, and the GPU hours after which the paper stopped its searches.
 CANDIDATES, STEPS, PAPER_HOURS = 725, 500_000, 1_500
-# What the public code gave on this software stack, in float32 with one seed: measured when this project was planned; there are
-# no curves of it here.
+# Returns of the public code with this software, in float32 with one seed: measured when this project was planned; there are no
+# curves of it here.
 REFERENCE = {("dm_control/cheetah-run-v0", 100_000): "AARL-State 436, SAC with DenseMLP 274 (seed 1, float32)"}
 # The paper's scores from pixels and from states.
 TABLES = {"CnnPolicy": 3, "MlpPolicy": 4}
@@ -59,7 +59,7 @@ def folders(results: Path) -> list[Path]:
 
 def section(folder: Path, results: Path) -> Iterator[str]:
     """
-    What there is to say of a benchmark: its tables, its runs and what they cost.
+    The section of a benchmark: its text, its tables, its runs and their cost.
 
     :param folder: Folder of the benchmark
     :param results: Folder it is in
@@ -72,7 +72,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
     yield "```text"
     yield printed_table(folder)
     yield "```\n"
-    abouts = read_abouts(folder)[0]
+    abouts = read_abouts(folder)
     yield from paper(abouts.values())
     finished = [(path, about) for path, about in abouts.items() if "seconds" in about]
     yield "| run | return | mean of the evaluations | minutes | threads | processor | commit | date |"
@@ -91,7 +91,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
             sessions[-1]["date"][:10],
         ]
         yield f"| {' | '.join(cells)} |"
-    yield "\nMade again by (`--out` another folder, `--workers` for several at once):\n"
+    yield "\nMade again by (`--folder` another folder, `--workers` for several at once):\n"
     yield "```bash"
     yield from commands(about for _, about in finished)
     yield "```\n"
@@ -100,7 +100,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
 
 def printed_table(folder: Path) -> str:
     """
-    What ``aarl table`` prints.
+    The output of ``aarl table``.
 
     :param folder: Folder of a benchmark
     """
@@ -114,23 +114,23 @@ def printed_table(folder: Path) -> str:
 
 def paper(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
     """
-    What the paper has on the same tasks at the same steps, where no variant is one of its own (else it is in the table), and
-    what the public code gave there.
+    The paper's scores on the same tasks at the same steps, unless a variant is one of its own: then they are in the table. And
+    the returns of the public code there.
 
-    :param abouts: What stands beside the curves
+    :param abouts: The ``provenance.json`` of the runs
     """
     abouts = list(abouts)
-    is_there = closest_table(about["variant"] for about in abouts) is not None
-    asked_for = [
+    in_table = closest_table(about["variant"] for about in abouts) is not None
+    compared = [
         (TABLES[about["hyperparameters"]["policy"]], step, about["environment"])
         for about in abouts
         for step in about["checkpoints"]
         if about["hyperparameters"]["policy"] in TABLES
     ]
-    for number, step, environment in dict.fromkeys(asked_for):
+    for number, step, environment in dict.fromkeys(compared):
         scores = paper_scores(number).query("checkpoint == @step and environment == @environment")
         cells = [f"{row.column} {row.mean:.0f} ± {row.std:.0f}" for row in scores.itertuples()]
-        if cells and not is_there:
+        if cells and not in_table:
             runs = scores["runs"].iloc[0]
             yield f"The paper's table {number}, {task_name(environment)} at {step:,}, {runs} runs: {', '.join(cells)}.\n"
         if number == 4 and (environment, step) in REFERENCE:
@@ -139,17 +139,18 @@ def paper(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
 
 def commands(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
     """
-    The commands that train runs again, one for all seeds of a variant on a task.
+    The commands that repeat runs, one for all seeds of a variant on a task.
 
-    :param abouts: What stands beside their curves
+    :param abouts: The ``provenance.json`` of the runs; those of another program than ``aarl`` are skipped
     """
     seeds: dict[tuple[str, str], list[int]] = {}
     for about in abouts:
+        if "program" in about:
+            continue
         steps, checkpoints = about["evaluations"], about["checkpoints"]
-        # The interval between checkpoints: the one that gives these evaluations.
+        # The interval between evaluations: the one that leads to these.
         every = [step for step in steps if sorted({*checkpoints, *range(step, steps[-1], step)}) == steps]
-        program = shlex.split(about.get("program", "aarl benchmark"))  # else it is emulated_bf16.py
-        before = [*program, about["file"], "--envs", task_name(about["environment"])]
+        before = ["aarl", "benchmark", about["file"], "--envs", task_name(about["environment"])]
         after = ["--checkpoints", ",".join(map(str, checkpoints))]
         after += ["--every", str(every[0])] if steps != checkpoints else []
         after += ["--episodes", str(about["evaluation_episodes"]), "--threads", str(about["sessions"][-1]["threads"])]
@@ -160,9 +161,9 @@ def commands(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
 
 def cost(abouts: list[dict[str, Any]]) -> Iterator[str]:
     """
-    What runs cost, and what a whole search from states would cost at that rate.
+    The cost of runs, and of a whole search from states at that rate.
 
-    :param abouts: What stands beside the curves of finished runs
+    :param abouts: The ``provenance.json`` of finished runs
     """
     if not abouts:
         return

@@ -12,10 +12,10 @@ import pandas as pd
 from sb3_aarl import catalog
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
-from search.execution.matrix import Cell, Matrix, all_cells, cell_folder, task_name
+from search.execution.matrix import Cell, Matrix, all_cells, task_name
 from search.training.config import ConfigError, action_repeat, load_hyperparameters, named_environments, resolve_env_id
 from search.training.provenance import ABOUT, read_about
-from search.training.run import Run, check_run
+from search.training.run import Run, check_run, checkpoint_interval
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
@@ -65,7 +65,7 @@ def load_benchmark(
     abouts: dict[Cell, dict[str, Any]] = {}
     for cell in all_cells(paths, ids, seeds):
         settings, steps = hyperparameters[cell[:2]], compared[cell.environment]
-        evaluations = _evaluations(steps, every, action_repeat(settings), cell)
+        evaluations = _evaluations(steps, every, checkpoint_interval(settings), cell)
         loss = settings["aux_loss"]
         runs[cell] = Run(
             environment=cell.environment,
@@ -93,7 +93,7 @@ def load_benchmark(
 
 def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     """
-    The ``provenance.json`` of a benchmark's runs, by their folders; ``failed`` is the reason of a run that failed.
+    The ``provenance.json`` of a benchmark's runs, by their folders.
 
     :param folder: Folder of a benchmark; runs that were copied there from another machine count too
     :raises ValueError: naming one that cannot be read, two folders that have the same run, or runs of a variant on an
@@ -107,8 +107,6 @@ def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
         if not {*Cell._fields, "checkpoints"} <= about.keys():
             raise ValueError(f"{path / ABOUT} is not that of a benchmark's run")
         abouts[path] = about
-        if (path / "failed.json").exists():
-            about["failed"] = json.loads((path / "failed.json").read_text(encoding="utf-8"))["reason"]
         cell = Cell(*(about[name] for name in Cell._fields))
         other = folders.setdefault(cell, path)
         if other != path:
@@ -188,7 +186,7 @@ def _default_checkpoints(environment: str, hyperparameters: Mapping[tuple[str, s
     return tuple(step for step in CHECKPOINTS if step <= budget)
 
 
-def _evaluations(checkpoints: Sequence[int], every: int | None, repeat: int, cell: Cell) -> tuple[int, ...]:
+def _evaluations(checkpoints: Sequence[int], every: int | None, interval: int, cell: Cell) -> tuple[int, ...]:
     """The environment steps of all evaluations of a run."""
     if sorted(set(checkpoints)) != list(checkpoints) or checkpoints[0] < 1:
         raise ConfigError(f"checkpoints must be positive environment steps in ascending order, not {list(checkpoints)}")
@@ -197,10 +195,9 @@ def _evaluations(checkpoints: Sequence[int], every: int | None, repeat: int, cel
     between = () if every is None else range(every, checkpoints[-1], every)
     steps = sorted({*checkpoints, *between})
     for step in steps:
-        if step % repeat:
-            raise ConfigError(
-                f"{cell.variant}: evaluations on {cell.environment} must be at multiples of its action repeat {repeat}, not {step}"
-            )
+        if step % interval:
+            where = f"{cell.variant}: evaluations on {cell.environment}"
+            raise ConfigError(f"{where} must be at multiples of {interval} (train_freq x n_envs x action repeat), not {step}")
     return tuple(steps)
 
 

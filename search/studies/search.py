@@ -9,19 +9,18 @@ import optuna
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
+from optuna.trial import TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
 from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import distributions
 from search.execution.matrix import Cell, Matrix, scores
 from search.studies.config import SearchConfig
 from search.training.run import Run
 
-# User attribute of a study: what decides the losses and the scores of its candidates.
+# User attribute of a study: what decides the scores of its candidates.
 SETTINGS_KEY = "settings"
-# Settings that change no score. A search may also get more generations.
-SCORELESS = ("n_timesteps", "device", "n_generations")
-MISSING = "missing"
+# Settings that change no score.
+SCORELESS = ("n_timesteps", "device")
 
 
 def make_run(
@@ -87,13 +86,14 @@ def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Stud
         direction="maximize",
         load_if_exists=True,
     )
-    problem = _other_parameters(study, config) or _other_settings(study, config)
-    if problem is not None:
+    difference = _difference(study, config)
+    if difference is not None:
         raise ValueError(
-            f"study {study.study_name!r} is not this search: {problem}. Another search needs a file of another name, or "
+            f"study {study.study_name!r} is not this search: {difference}. Another search needs a file of another name, or "
             "another storage"
         )
-    study.set_user_attr(SETTINGS_KEY, _decisive(config))
+    sampler.free_slots(study)  # refuses a study that was started with other settings of the sampler
+    study.set_user_attr(SETTINGS_KEY, _run_settings(config))
     return study, sampler
 
 
@@ -108,15 +108,6 @@ def make_pruner(config: SearchConfig) -> BasePruner:
     if config.pruner == "hyperband":
         return HyperbandPruner(min_resource=config.checkpoints[0], max_resource=config.checkpoints[-1])
     return NopPruner()
-
-
-def is_search(study: optuna.Study) -> bool:
-    """
-    Whether a study was started by :func:`open_search`.
-
-    :param study: Any study
-    """
-    return SETTINGS_KEY in study.user_attrs
 
 
 def baselines(config: SearchConfig, folder: Path) -> Matrix:
@@ -149,42 +140,33 @@ def baseline_scores(config: SearchConfig, folder: Path) -> list[tuple[str, float
 
 def settings(config: SearchConfig) -> dict[str, Any]:
     """
-    What notes and reports show of a search: its settings and its hyper-parameters in plain values.
+    What notes and reports show of a search: the settings of its runs and of its sampler, in plain values.
 
     :param config: The search
     """
-    return {**_decisive(config), "pruner": config.pruner, "retries": config.retries}
-
-
-def _decisive(config: SearchConfig) -> dict[str, Any]:
-    """All that decides losses and scores, as JSON gives it back."""
-    run = make_run(config, config.environment, None, config.seeds[0]).model_dump(mode="json")
-    hyperparameters = run.pop("hyperparameters")
-    for key in ("aux_loss", "seed", "keep_model"):
-        run.pop(key)
     sampler = config.sampler_settings()
     sampler["initial"] = [str(loss) for loss in sampler["initial"]]
-    return json.loads(json.dumps({**run, "seeds": list(config.seeds), **sampler, **hyperparameters}))
+    return json.loads(json.dumps({**_run_settings(config), **sampler, "pruner": config.pruner}))
 
 
-def _other_settings(study: optuna.Study, config: SearchConfig) -> str | None:
-    """The first setting that differs from those that a study was started with."""
-    asked = _decisive(config)
-    stored = study.user_attrs.get(SETTINGS_KEY, asked)
-    for key in stored | asked:
-        old, new = stored.get(key, MISSING), asked.get(key, MISSING)
-        if old != new and key not in SCORELESS:
-            return f"it was started with {key}={old!r}, not {new!r}"
-    return None
+def _run_settings(config: SearchConfig) -> dict[str, Any]:
+    """All that decides the score of a loss, as read from JSON, and the seed of the search."""
+    run = make_run(config, config.environment, None, config.seeds[0]).model_dump(mode="json")
+    hyperparameters = run.pop("hyperparameters")
+    names = ("environment", "checkpoints", "evaluation_episodes", "threads", "imports")
+    return {**{name: run[name] for name in names}, "seeds": list(config.seeds), "seed": config.seed, **hyperparameters}
 
 
-def _other_parameters(study: optuna.Study, config: SearchConfig) -> str | None:
-    """What of a study's direction and parameters is not of this search's space."""
+def _difference(study: optuna.Study, config: SearchConfig) -> str | None:
+    """The first thing that makes a study another one than that of a search."""
     if study.directions != [StudyDirection.MAXIMIZE]:
         return f"its directions are {[direction.name.lower() for direction in study.directions]}, not one to maximize"
-    space = distributions(config.max_horizon, config.max_horizon, config.operators)
-    for trial in study.get_trials(deepcopy=False):
-        for name, distribution in trial.distributions.items():
-            if distribution != space.get(name):
-                return f"trial {trial.number} has the parameter {name!r}, {distribution}, not {space.get(name, MISSING)}"
+    stored, asked = study.user_attrs.get(SETTINGS_KEY), _run_settings(config)
+    if stored is None:
+        has_trials = any(trial.state != TrialState.WAITING for trial in study.get_trials(deepcopy=False))
+        return "it has trials of another program" if has_trials else None
+    for key in stored | asked:
+        old, new = stored.get(key), asked.get(key)
+        if old != new and key not in SCORELESS:
+            return f"it was started with {key}={old!r}, not {new!r}"
     return None

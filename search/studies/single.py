@@ -8,7 +8,7 @@ from sb3_aarl import catalog
 from sb3_aarl.callbacks import Evaluation
 from sb3_aarl.envs import PREFIX
 from search.training.config import ConfigError, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
-from search.training.run import Run, check_run, is_finished, prepare_run, spread_checkpoints, train
+from search.training.run import Run, check_run, checkpoint_interval, is_finished, prepare_run, spread_checkpoints, train
 
 
 def train_one(
@@ -48,17 +48,16 @@ def train_one(
         loss = None
     elif loss != "auto":
         loss = str(catalog.resolve(loss))
-    repeat = action_repeat(hyperparameters)
     if environment_steps is None:
         if "n_timesteps" not in hyperparameters:
             raise ConfigError(f"how many steps? {config} has no n_timesteps for {environment}")
-        environment_steps = hyperparameters["n_timesteps"] * repeat
+        environment_steps = hyperparameters["n_timesteps"] * action_repeat(hyperparameters)
     run = Run(
         environment=environment,
         aux_loss=loss,
         hyperparameters=hyperparameters,
         seed=seed,
-        checkpoints=spread_checkpoints(environment_steps, n_evaluations, repeat),
+        checkpoints=spread_checkpoints(environment_steps, n_evaluations, checkpoint_interval(hyperparameters)),
         evaluation_episodes=evaluation_episodes,
         threads=threads,
         keep_model=True,

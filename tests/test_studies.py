@@ -1,0 +1,251 @@
+"""The paper's procedures: the study of a search, its runs, baselines, cross-validation, operators; one run by hand."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pandas as pd
+import pytest
+import yaml
+from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
+from optuna.storages import InMemoryStorage
+from optuna.trial import create_trial
+from tiny import SEARCH, YAML, write_search
+
+from sb3_aarl import AuxLoss, SACAux
+from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
+from search.evolution.space import distributions, loss_to_params
+from search.execution.matrix import Cell, Matrix, cell_folder
+from search.studies import cross_validation, operator_selection
+from search.studies.config import SearchConfig, load_config
+from search.studies.search import SETTINGS_KEY, baseline_scores, baselines, make_pruner, open_search, runs_of, settings
+from search.studies.single import train_one
+from search.training.config import ConfigError, load_aux_loss
+from search.training.run import prepare_run
+
+PARTS = """\
+cross_validation:
+  environments: [Pendulum-v1, MountainCarContinuous-v0]
+  seeds: [1, 2]
+  top: 2
+  checkpoints: {MountainCarContinuous-v0: [100]}
+operator_selection:
+  environments: [Pendulum-v1]
+  seeds: [0, 1]
+baselines:
+- {name: CURL, aux_loss: curl}
+- {name: SAC, overrides: {gamma: 0.9}}
+"""
+LOSSES = [AuxLoss.parse(text) for text in ("{s_t} -> {s_t+1}", "{s_t, a_t} -> {r_t}", "{s_t+1} -> {s_t+2}")]
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> SearchConfig:
+    return load_config(write_search(tmp_path, SEARCH + PARTS))
+
+
+def add_trials(study: optuna.Study, scores: list[float]) -> None:
+    for loss, score in zip(LOSSES, scores, strict=True):
+        study.add_trial(create_trial(params=loss_to_params(loss), distributions=distributions(loss.horizon, 3), value=score))
+
+
+def finish(matrix: Matrix, scores: dict[Cell, float]) -> None:
+    """Curves as if runs were finished."""
+    for cell, score in scores.items():
+        run, folder = matrix.runs[cell], cell_folder(matrix.folder, cell)
+        prepare_run(folder, run)
+        write_curve(folder / "curve.csv", [Evaluation(steps, score, 0.0, 1, 1.0) for steps in run.checkpoints])
+
+
+# The study of a search.
+
+
+def test_a_search_is_opened_again(config: SearchConfig, tmp_path: Path) -> None:
+    storage = InMemoryStorage()
+    study, sampler = open_search(config, storage)
+    study.enqueue_trial(loss_to_params(LOSSES[0]))
+    more = {"generations": 9, "retries": 1, "overrides": {"device": "cpu"}, "pruner": "median"}
+    again, _ = open_search(config.model_copy(update=more), storage)
+    assert again.study_name == "small" and len(again.trials) == 1
+    assert study.direction == optuna.study.StudyDirection.MAXIMIZE and study.sampler is sampler
+    assert isinstance(again.pruner, MedianPruner)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"environment": "MountainCarContinuous-v0"}, "environment='Pendulum-v1', not 'MountainCarContinuous-v0'"),
+        ({"checkpoints": (200, 600)}, r"checkpoints=\[200, 400\], not \[200, 600\]"),
+        ({"evaluation_episodes": 3}, "evaluation_episodes=1, not 3"),
+        ({"seeds": (1,)}, r"seeds=\[0\], not \[1\]"),
+        ({"threads": 2}, "threads=1, not 2"),
+        ({"overrides": {"batch_size": 16}}, "batch_size=8, not 16"),
+        ({"population_size": 6}, "population_size=4, not 6"),
+        ({"initial": (LOSSES[1],)}, r"initial=\[\], not \['{s_t, a_t} -> {r_t}'\]"),
+        ({"seed": 4}, "seed=3, not 4"),
+    ],
+    ids=str,
+)
+def test_a_search_with_other_settings_is_another_one(
+    config: SearchConfig, tmp_path: Path, changed: dict[str, Any], message: str
+) -> None:
+    storage = InMemoryStorage()
+    study, _ = open_search(config, storage)
+    stored = study.user_attrs
+    with pytest.raises(ValueError, match=f"was started with {message}"):
+        open_search(config.model_copy(update=changed), storage)
+    assert optuna.load_study(study_name="small", storage=storage).user_attrs == stored
+
+
+def test_a_study_of_another_kind_is_refused_and_stays_as_it_is(config: SearchConfig, tmp_path: Path) -> None:
+    storage = InMemoryStorage()
+    study = optuna.create_study(storage=storage, study_name="small")
+    with pytest.raises(ValueError, match=r"directions are \['minimize'\]"):
+        open_search(config, storage)
+    optuna.delete_study(study_name="small", storage=storage)
+    study = optuna.create_study(storage=storage, study_name="small", direction="maximize")
+    study.tell(study.ask({"learning_rate": optuna.distributions.FloatDistribution(0, 1)}), 0.0)
+    with pytest.raises(ValueError, match="'small' is not this search: it has trials of another program"):
+        open_search(config, storage)
+    assert SETTINGS_KEY not in study.user_attrs
+
+
+def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None:
+    runs = runs_of(config.model_copy(update={"seeds": (4, 9), "imports": ("json",), "threads": 2}))(LOSSES[0])
+    assert [run.seed for run in runs] == [4, 9]
+    for run in runs:
+        assert (run.environment, run.aux_loss, run.threads, run.imports) == ("Pendulum-v1", str(LOSSES[0]), 2, ("json",))
+        assert (run.checkpoints, run.evaluation_episodes) == ((200, 400), 1)
+        assert run.hyperparameters["policy_kwargs"]["net_arch"] == [8]
+
+
+def test_shown_settings_are_plain(config: SearchConfig) -> None:
+    shown = settings(config)
+    assert json.loads(json.dumps(shown)) == shown
+    assert shown["population_size"] == 4 and shown["batch_size"] == 8 and shown["environment"] == "Pendulum-v1"
+
+
+def test_pruners(config: SearchConfig) -> None:
+    pruners = [make_pruner(config.model_copy(update={"pruner": name})) for name in ("none", "median", "hyperband")]
+    assert [type(pruner) for pruner in pruners] == [NopPruner, MedianPruner, HyperbandPruner]
+
+
+# Matrices.
+
+
+def test_baselines_have_the_settings_of_the_search_and_their_own(config: SearchConfig, tmp_path: Path) -> None:
+    matrix = baselines(config, tmp_path)
+    cells = [Cell("CURL", "Pendulum-v1", 0), Cell("SAC", "Pendulum-v1", 0)]
+    assert list(matrix.runs) == cells and matrix.folder == tmp_path / "baselines"
+    curl, sac = (matrix.runs[cell] for cell in cells)
+    assert curl.aux_loss is not None and "gamma" not in curl.hyperparameters
+    assert sac.aux_loss is None and sac.hyperparameters["gamma"] == 0.9 and sac.checkpoints == (200, 400)
+    assert baseline_scores(config, tmp_path) == []
+    finish(matrix, {cells[1]: -7.0})
+    assert baseline_scores(config, tmp_path) == [("SAC", -7.0)]
+
+
+def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    study, _ = open_search(config, InMemoryStorage())
+    with pytest.raises(ValueError, match="no completed candidate"):
+        cross_validation.make_matrix(config, study, tmp_path)
+    add_trials(study, [5.0, 9.0, 8.0])
+    assert cross_validation.top_losses(study, 9) == [LOSSES[1], LOSSES[0]]  # the last is the first, a step later
+    matrix = cross_validation.make_matrix(config, study, tmp_path)
+    environments = ["Pendulum-v1", "MountainCarContinuous-v0"]
+    expected = [Cell(str(loss), name, seed) for seed in (1, 2) for name in environments for loss in (LOSSES[1], LOSSES[0])]
+    assert list(matrix.runs) == expected and matrix.folder == tmp_path / "cross-validation"
+    assert {run.environment: run.checkpoints for run in matrix.runs.values()} == {
+        "Pendulum-v1": (200, 400),
+        "MountainCarContinuous-v0": (100,),
+    }
+    assert "as the search" not in caplog.text
+    cross_validation.make_matrix(config.model_copy(update={"seeds": (0, 2)}), study, tmp_path, top=1)
+    assert "seeds has 2, as the search" in caplog.text
+    with pytest.raises(ConfigError, match="cross_validation is missing"):
+        cross_validation.make_matrix(config.model_copy(update={"cross_validation": None}), study, tmp_path)
+
+
+def test_a_ranking_deviates_over_seeds_not_over_environments(tmp_path: Path) -> None:
+    rows = [(str(LOSSES[0]), *cell) for cell in [("x", 0, 99.0), ("x", 1, 101.0), ("y", 0, 899.0), ("y", 1, 905.0)]]
+    rows += [(str(LOSSES[1]), environment, seed, 0.0) for _, environment, seed, _ in rows]
+    table = cross_validation.ranking(pd.DataFrame(rows, columns=["variant", "environment", "seed", "score"]))
+    row = table.iloc[0]
+    assert (row["x"], row["y"], row["mean"], row["runs"]) == (100.0, 902.0, 501.0, 4)
+    assert row["std"] == pytest.approx(np.std([499.0, 503.0], ddof=1))
+    assert cross_validation.write_winner(table, tmp_path / "winner.yml") == LOSSES[0]
+    assert load_aux_loss(tmp_path / "winner.yml") == LOSSES[0]
+
+
+def test_ten_operators_on_forward_dynamics(config: SearchConfig, tmp_path: Path) -> None:
+    matrix = operator_selection.make_matrix(config, tmp_path)
+    assert len(matrix.runs) == 10 * 2 and matrix.folder == tmp_path / "operators"
+    losses = {AuxLoss.parse(str(run.aux_loss)) for run in matrix.runs.values()}
+    assert len(losses) == 10 and len({(loss.source, loss.target) for loss in losses}) == 1
+    with pytest.raises(ConfigError, match="operator_selection is missing"):
+        operator_selection.make_matrix(config.model_copy(update={"operator_selection": None}), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        # Mean of both -600, -200: each divided by that, its sign kept. Sample deviations of two numbers.
+        ({"a": [-300.0, -100.0], "b": [-900.0, -300.0]}, {"a": (-0.5, 0.0), "b": (-1.5, 0.0)}),
+        # 200 and -600: a is 0.5 and -0.5, b 1.5 and -1.5.
+        ({"a": [100.0, -300.0], "b": [300.0, -900.0]}, {"a": (0.0, 0.5 * 2**0.5), "b": (0.0, 1.5 * 2**0.5)}),
+        ({"a": [100.0, 30.0], "b": [300.0, 90.0]}, {"b": (1.0, 0.0), "a": (1 / 3, 0.0)}),
+        ({"a": [0.0, 0.0], "b": [0.0, 0.0]}, {"a": (0.0, 0.0), "b": (0.0, 0.0)}),
+    ],
+    ids=["negative", "both signs", "positive", "zero"],
+)
+def test_normalized_returns_rank_the_higher_one_first(
+    returns: dict[str, list[float]], expected: dict[str, tuple[float, float]]
+) -> None:
+    rows = [(variant, task, last) for variant, values in returns.items() for task, last in zip("xy", values, strict=True)]
+    table = operator_selection.table(pd.DataFrame(rows, columns=["variant", "environment", "last"]))
+    assert list(table.index) == list(expected)
+    for variant, numbers in expected.items():
+        assert tuple(table.loc[variant, ["mean", "std"]]) == pytest.approx(numbers)
+
+
+# One run by hand.
+
+
+@pytest.mark.slow
+def test_one_run_keeps_its_model_and_is_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.yml").write_text(YAML + "  n_timesteps: 205\n")
+    Path("winner.yml").write_text(yaml.safe_dump({"aux_loss": LOSSES[0]}))
+    arguments: dict[str, Any] = {"environment": "Pendulum-v1", "config": "own.yml", "evaluation_episodes": 1, "seed": 3}
+    curve, folder, was_finished = train_one(aux_loss="winner.yml", n_evaluations=2, **arguments)
+    assert folder.parent == Path("runs") and folder.name.startswith("pendulum-v1-winner-yml-") and not was_finished
+    assert [point.environment_steps for point in curve] == [102, 204] and curve == read_curve(folder / "curve.csv")
+    model = SACAux.load(folder / "model.zip")
+    assert model.num_timesteps == 204 and model.aux_loss == LOSSES[0]
+    about = json.loads((folder / "provenance.json").read_text())
+    assert about["aux_loss"] == str(LOSSES[0]) and about["hyperparameters"]["batch_size"] == 8 and about["seconds"] > 0
+    assert train_one(aux_loss=str(LOSSES[0]), n_evaluations=2, folder=folder, **arguments) == (curve, folder, True)
+    with pytest.raises(ValueError, match=f"{folder} has another run: aux_loss is"):
+        train_one(aux_loss="none", n_evaluations=2, folder=folder, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("text", "changed", "message"),
+    [
+        ("", {}, "how many steps"),
+        ("  n_timesteps: 4\n", {}, "too few"),
+        ("", {"environment": "Pendulm-v1"}, "nearest: Pendulum-v1"),
+        ("", {"environment": "CartPole-v1", "environment_steps": 100}, "CartPole-v1 cannot be trained"),
+        ("", {"aux_loss": "crul"}, "curl"),
+    ],
+)
+def test_what_cannot_be_trained_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, changed: dict[str, Any], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.yml").write_text(YAML + text)
+    with pytest.raises(ValueError, match=message):
+        train_one(**{"environment": "Pendulum-v1", "aux_loss": None, "config": "own.yml", **changed})
+    assert not Path("runs").exists()
