@@ -13,7 +13,7 @@ from sb3_aarl import AuxLoss, search_space_size
 from sb3_aarl.aux_loss import OPERATORS, Token
 
 # A busy machine is no failure.
-relaxed = settings(deadline=None)
+relaxed = settings(deadline=None, max_examples=50)
 
 
 @st.composite
@@ -184,8 +184,6 @@ def test_arguments_and_brackets() -> None:
         ("{s_t} -> {s_t} []", 15, "an operator, .* instead of ''"),
         ("{s_t} -> {s_t} [mse, cosine]", 15, "an operator, .* each once only, instead of 'cosine'"),
         ("{s_t} -> {s_t} [horizon=5, horizon=6]", 15, "an operator, .* each once only, instead of 'horizon=6'"),
-        ("{s_t} -> {s_t+1001}", 10, "an offset of at most 1000"),
-        ("{s_t} -> {s_t+" + "9" * 5000 + "}", 10, "an offset of at most 1000"),
     ],
 )
 def test_what_cannot_be_read_says_where(text: str, position: int, expected: str) -> None:
@@ -193,12 +191,6 @@ def test_what_cannot_be_read_says_where(text: str, position: int, expected: str)
         AuxLoss.parse(text)
     found = repr(text[position : position + 10]) if position < len(text) else "the end"
     assert f"found {found}: " in str(error.value)
-
-
-@pytest.mark.parametrize("text", [None, 7, b"{s_t} -> {s_t}", ["{s_t} -> {s_t}"]])
-def test_a_notation_is_text(text: object) -> None:
-    with pytest.raises(ValueError, match="a notation is a string"):
-        AuxLoss.parse(text)  # type: ignore[arg-type]
 
 
 YES, NO = (True, False, False, False), (False,) * 4
@@ -236,6 +228,7 @@ def test_an_invalid_loss_names_the_rule(arguments: tuple, rule: str) -> None:
         ("{s_t} -> {a_t+2}", 2, r"a_t\+2 needs a horizon of at least 3, not 2"),
         ("{s_t} -> {s_t+3}", 2, r"s_t\+3 needs a horizon of at least 3, not 2"),
         ("{s_t} -> {a_t+1000}", None, "from 1 to 1000, not 1001"),
+        ("{s_t} -> {s_t+99999999999}", None, "from 1 to 1000, not 99999999999"),
         ("{s_t} -> {s_t}", "two", "horizon must be an integer .* not 'two'"),
         ("{s_t} -> {s_t} [horizon=0]", None, "horizon must be an integer .* not 0"),
     ],

@@ -112,9 +112,9 @@ def test_shape_of_the_published_tables() -> None:
         14: ("Quadruped-Run", "state", [5] * 5),
     }
     expected = [
-        (table, environment, observation, stage, rank)
-        for table, (environment, observation, places) in tables.items()
-        for stage, ranks in enumerate(places, start=1)
+        (table, environment, observation, generation, rank)
+        for table, (environment, observation, sizes) in tables.items()
+        for generation, ranks in enumerate(sizes, start=1)
         for rank in range(1, ranks + 1)
     ]
     assert [entry[1:] for entry in published] == expected
@@ -124,122 +124,71 @@ def test_shape_of_the_published_tables() -> None:
         assert entry.loss == entry.loss.canonical()
 
 
-# Copied from the paper, two candidates of every stage: table, stage, rank and what it prints.
+# Copied from the paper, one candidate of every generation: table, generation, rank and what it prints.
 PRINTED = r"""
 9 1 2 \{s_t, a_t, r_t\}
   \rightarrow \{s_{t+1}\}
-9 1 5 \{s_t, a_t, s_{t+1}, a_{t+1}, s_{t+2}, r_{t+2}\}
-  \rightarrow \{s_t, s_{t+1}, r_{t+1}, s_{t+2}, r_{t+2}, s_{t+3}\}
 9 2 2 \{s_t, a_t, a_{t+2}, r_{t+2}\}
   \rightarrow \{s_t, r_t, s_{t+1}, s_{t+2}, r_{t+2}\}
-9 2 5 \{r_t, s_{t+1}, r_{t+1}\}
-  \rightarrow \{s_t, a_t, a_{t+1}, s_{t+2}\}
 9 3 1 \{s_t, a_t, a_{t+2}, r_{t+2}\}
   \rightarrow \{s_t, s_{t+1}, s_{t+2}, r_{t+2}\}
-9 3 5 \{r_t, s_{t+1}\}
-  \rightarrow \{s_t, a_t, a_{t+1}, s_{t+2}\}
 9 4 2 \{s_t, a_t, a_{t+1}, r_{t+1}, r_{t+2}, s_{t+3}, a_{t+3}\}
   \rightarrow \{s_{t+1}, s_{t+2}, r_{t+3}, s_{t+4}\}
-9 4 5 \{r_t, s_{t+1}, a_{t+1}\}
-  \rightarrow \{s_t, a_t, a_{t+1}, s_{t+2}\}
 9 5 3 \{s_{t+1}, a_{t+1}, a_{t+2}, a_{t+3}\}
   \rightarrow \{r_t, r_{t+1}, s_{t+2}, s_{t+3}\}
-9 5 4 \{s_t\}
-  \rightarrow \{s_t, r_t, s_{t+1}, r_{t+1}, s_{t+2}\}
 9 6 2 \{s_t, a_{t+1}, a_{t+3}, s_{t+4}, r_{t+4}\}
   \rightarrow \{s_{t+1}, s_{t+2}, a_{t+3}, s_{t+4}, a_{t+4}, s_{t+5}\}
-9 6 5 \{s_t, a_{t+1}, a_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, s_{t+4}, r_{t+4}\}
-  \rightarrow \{s_{t+1}, a_{t+1}, s_{t+2}, r_{t+2}, s_{t+4}, a_{t+4}, r_{t+4}, s_{t+5}\}
 9 7 2 \{s_t, r_{t+2}, a_{t+3}, s_{t+4}\}
   \rightarrow \{a_t, s_{t+1}, s_{t+2}, r_{t+2}, a_{t+3}, r_{t+3}, s_{t+4}, a_{t+4}, r_{t+4}, s_{t+5}\}
-9 7 5 \{s_t, a_{t+1}, r_{t+2}, a_{t+3}, s_{t+4}, r_{t+4}\}
-  \rightarrow \{s_{t+1}, s_{t+2}, r_{t+2}, a_{t+3}, s_{t+4}, a_{t+4}, s_{t+5}, a_{t+5}\}
 12 1 1 \{s_t, a_t, r_t, a_{t+1}, r_{t+1}\}
   \rightarrow \{s_{t+1}, s_{t+2}\}
-12 1 2 \{a_t, r_t, s_{t+2}, a_{t+2}, a_{t+3}, r_{t+3}\}
-  \rightarrow \{s_t, s_{t+1}, a_{t+1}, s_{t+3}, s_{t+4}\}
 12 2 1 \{s_t, a_t, r_t, a_{t+1}, r_{t+1}\}
   \rightarrow \{s_{t+1}, s_{t+2}\}
-12 2 5 \{s_t, a_t, r_t\}
-  \rightarrow \{r_t, s_{t+1}\}
 12 3 1 \{s_t, a_t, r_t, a_{t+1}, r_{t+1}\}
   \rightarrow \{s_{t+1}\}
-12 3 5 \{s_t, a_t, a_{t+1}, r_{t+1}\}
-  \rightarrow \{s_t, s_{t+1}, s_{t+2}\}
 12 4 3 \{s_t, a_t, a_{t+1}, a_{t+2}, r_{t+2}, r_{t+3}, a_{t+4}, r_{t+4}, a_{t+5}, a_{t+6}, a_{t+7}, a_{t+8}, r_{t+8}\}
   \rightarrow \{a_t, s_{t+1}, s_{t+2}, a_{t+2}, s_{t+3}, s_{t+4}, s_{t+6}, a_{t+8}, s_{t+9}\}
-12 4 4 \{s_t, a_t, a_{t+1}, s_{t+2}, a_{t+2}, a_{t+3}, r_{t+3}, a_{t+4}, r_{t+4}, a_{t+5}, a_{t+7}, s_{t+8}, a_{t+8}, r_{t+8}\}
-  \rightarrow \{s_{t+1}, s_{t+3}, a_{t+4}, s_{t+6}, s_{t+9}\}
 12 5 1 \{s_t, a_t, r_t, a_{t+1}\}
   \rightarrow \{s_{t+1}, r_{t+1}\}
-12 5 5 \{s_t, a_t, r_t, a_{t+1}\}
-  \rightarrow \{s_{t+1}, s_{t+2}\}
 12 6 4 \{s_t, a_t, r_t, a_{t+1}\}
-  \rightarrow \{s_{t+1}, s_{t+2}\}
-12 6 5 \{s_t, a_t, r_t, a_{t+1}\}
   \rightarrow \{s_{t+1}, s_{t+2}\}
 12 7 1 \{s_t, a_t, r_t, a_{t+1}, r_{t+1}\}
   \rightarrow \{s_{t+1}, s_{t+2}\}
-12 7 4 \{s_t, a_t, a_{t+1}\}
-  \rightarrow \{s_{t+1}, a_{t+1}, s_{t+2}\}
 13 1 1 \{s_t, a_t\}
   \rightarrow \{r_t, s_{t+1}\}
-13 1 5 \{s_t, r_t\}
-  \rightarrow \{s_t, r_t, s_{t+1}\}
 13 2 1 \{s_t, a_t, s_{t+1}, a_{t+1}\}
   \rightarrow \{s_{t+1}, s_{t+2}\}
-13 2 2 \{s_t, a_t, r_t, s_{t+2}, r_{t+2}\}
-  \rightarrow \{r_{t+1}, s_{t+2}, a_{t+2}, s_{t+3}\}
 13 3 1 \{s_t\}
   \rightarrow \{s_t, a_t, r_t, s_{t+1}\}
-13 3 4 \{s_t, a_t, a_{t+1}\}
-  \rightarrow \{s_t, s_{t+1}, s_{t+2}\}
 13 4 2 \{s_t, a_t, s_{t+1}, a_{t+1}\}
   \rightarrow \{s_{t+2}\}
-13 4 4 \{s_t, a_{t+1}, s_{t+2}, a_{t+2}, r_{t+2}\}
-  \rightarrow \{s_{t+1}, r_{t+1}, a_{t+2}, s_{t+3}\}
 13 5 2 \{s_t, a_{t+1}, r_{t+1}, s_{t+2}, a_{t+2}, r_{t+2}\}
   \rightarrow \{s_t, r_{t+1}, s_{t+2}, a_{t+2}, s_{t+3}\}
-13 5 4 \{s_t, r_t, a_{t+1}, s_{t+2}, r_{t+2}\}
-  \rightarrow \{s_{t+1}, a_{t+2}, s_{t+3}\}
 13 6 2 \{s_t, r_t, s_{t+2}, a_{t+2}, r_{t+2}\}
   \rightarrow \{s_t, s_{t+1}, s_{t+2}, s_{t+3}\}
-13 6 4 \{s_t, a_t, r_t, s_{t+1}, a_{t+1}, r_{t+1}\}
-  \rightarrow \{r_t, s_{t+1}, s_{t+2}\}
 14 1 1 \{a_t, r_t, s_{t+1}, s_{t+2}, a_{t+2}\}
   \rightarrow \{s_t, a_{t+1}, s_{t+3}\}
-14 1 3 \{a_t, a_{t+1}, r_{t+1}, s_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}\}
-  \rightarrow \{s_t, s_{t+1}, a_{t+2}, s_{t+4}\}
 14 2 1 \{a_t, r_t, a_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, a_{t+4}\}
   \rightarrow \{s_t, s_{t+1}, a_{t+1}, s_{t+2}, s_{t+4}, s_{t+5}\}
-14 2 3 \{a_{t+1}, r_{t+1}, s_{t+2}, a_{t+3}, r_{t+3}\}
-  \rightarrow \{s_t, a_t, r_t, a_{t+1}, a_{t+3}, s_{t+4}\}
 14 3 3 \{a_t, r_t, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, r_{t+4}\}
   \rightarrow \{s_t, s_{t+1}, a_{t+1}, s_{t+2}, a_{t+2}, a_{t+3}, s_{t+4}, s_{t+5}\}
-14 3 5 \{s_t, a_t, r_t, r_{t+1}, a_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, s_{t+4}, s_{t+5}\}
-  \rightarrow \{a_t, a_{t+1}, r_{t+1}, a_{t+2}, r_{t+3}\}
 14 4 1 \{r_t, r_{t+1}, a_{t+2}, r_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, s_{t+4}, s_{t+5}\}
   \rightarrow \{a_{t+2}, r_{t+3}, a_{t+4}\}
-14 4 3 \{a_t, a_{t+1}, a_{t+3}, r_{t+3}, s_{t+4}\}
-  \rightarrow \{s_{t+1}, r_{t+1}, s_{t+2}, a_{t+2}, r_{t+2}, s_{t+3}\}
 14 5 1 \{a_{t+1}, r_{t+1}, s_{t+2}, a_{t+2}, r_{t+2}, a_{t+3}, r_{t+3}\}
   \rightarrow \{s_t, a_t, r_t, a_{t+1}, r_{t+1}, a_{t+2}, s_{t+3}, a_{t+3}\}
-14 5 5 \{s_t, a_t, r_t, r_{t+1}, a_{t+2}, s_{t+3}, a_{t+3}, r_{t+3}, s_{t+5}\}
-  \rightarrow \{a_t, a_{t+2}, r_{t+3}, a_{t+4}\}
 """
 
 
-@pytest.mark.parametrize("entry", PRINTED.replace("\n ", "").strip().splitlines())
-def test_published_losses_are_the_papers(entry: str) -> None:
-    *place, printed = entry.split(maxsplit=3)
-    table, stage, rank = map(int, place)
-    (loss,) = (p.loss for p in catalog.published() if (p.table, p.stage, p.rank) == (table, stage, rank))
-    assert as_sets(loss) == read_latex(printed)
-    assert loss.latex() == printed
+def test_published_losses_are_the_papers() -> None:
+    losses = {(p.table, p.generation, p.rank): p.loss for p in catalog.published()}
+    for entry in PRINTED.replace("\n ", "").strip().splitlines():
+        *where, printed = entry.split(maxsplit=3)
+        loss = losses[tuple(map(int, where))]
+        assert as_sets(loss) == read_latex(printed)
+        assert loss.latex() == printed
 
 
 def test_the_two_chosen_losses_are_published_candidates() -> None:
-    # Appendix D.1 calls AARL-Pixel a candidate of stage 4, but table 9 marks the one of stage 5.
-    places = {"aarl-pixel": (9, 5, 3), "aarl-state": (12, 4, 4)}
-    for name, place in places.items():
-        assert [(p.table, p.stage, p.rank) for p in catalog.published() if p.loss == catalog.load(name)] == [place]
+    # Appendix D.1 calls AARL-Pixel a candidate of generation 4, but table 9 marks the one of generation 5.
+    for name, printed in {"aarl-pixel": (9, 5, 3), "aarl-state": (12, 4, 4)}.items():
+        assert [(p.table, p.generation, p.rank) for p in catalog.published() if p.loss == catalog.load(name)] == [printed]

@@ -118,8 +118,3 @@ def test_the_weight_of_bilinear_starts_as_in_curl() -> None:
 def test_unknown_operator() -> None:
     with pytest.raises(ValueError, match="unknown operator 'huber', expected one of inner, bilinear, cosine, mse, n_mse"):
         Operator("huber", False, 3)
-
-
-@pytest.mark.parametrize("name, negatives", TEN)
-def test_printed_form_names_the_operator(name: str, negatives: bool) -> None:
-    assert str(Operator(name, negatives, 2)) == f"Operator({name}, negatives={negatives})"

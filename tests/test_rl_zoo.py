@@ -46,6 +46,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "logs/sac_aux/dm_control-cheetah-run-v0_1"
 
 
+@pytest.mark.slow
 def test_trains_with_the_hyperparameters_of_the_file(trained: Path) -> None:
     model = SACAux.load(trained / "dm_control-cheetah-run-v0.zip", device="cpu")
     assert type(model) is SACAux and model.num_timesteps == 280 and model._n_updates == 20
@@ -62,6 +63,7 @@ def test_trains_with_the_hyperparameters_of_the_file(trained: Path) -> None:
     assert np.load(trained / "evaluations.npz")["ep_lengths"].tolist() == [[250]]
 
 
+@pytest.mark.slow
 def test_enjoy_record_video_and_plot_train(trained: Path) -> None:
     folder = trained.parents[2]
     programs = [
@@ -94,10 +96,11 @@ def added(arguments: list[str]) -> dict[str, object]:
     return {key: literal_eval(value) for key, _, value in (item.partition(":") for item in values)}
 
 
+@pytest.mark.slow
 def test_optimizes_what_rl_zoo_optimizes_of_sac(tmp_path: Path) -> None:
     pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
     trials = ["-optimize", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1", "--sampler", "random"]
-    trials += ["--pruner", "none"]  # RL-Zoo prunes trials that fail, and a pruner the second one if it is worse than the first
+    trials += ["--pruner", "none"]  # RL-Zoo prunes failed trials; a pruner might prune the second trial
     settings = ["-n", "280", "--eval-episodes", "1", "--device", "cpu", "--seed", "3", "-params", "learning_starts:260"]
     run(tmp_path, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "aarl_state.yml"), *trials, *settings)
     (report,) = (tmp_path / "logs" / "sac_aux").glob("report_*.csv")
