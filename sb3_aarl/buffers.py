@@ -1,27 +1,28 @@
 """WindowReplayBuffer: windows of consecutive steps out of a replay buffer that stores each frame once."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from gymnasium.wrappers import FrameStackObservation
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
+from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.utils import get_device
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_aarl.augmentation import image_spaces
-from sb3_aarl.frame_store import FrameStore, rows_equal
+from sb3_aarl.frame_store import FrameStore, detect_frame_stack, rows_equal
 
 try:
     import psutil
 except ImportError:  # an extra of SB3
     psutil = None  # type: ignore[assignment]
 
+__all__ = ["NoWindowError", "WindowReplayBuffer", "WindowSamples", "detect_frame_stack"]
 
 # Rounds in which steps that end no whole window are drawn again, before all that do are looked up. In a buffer of a million
 # steps a lookup takes 3 % of a gradient step.
@@ -34,7 +35,7 @@ class WindowSamples(NamedTuple):
     """
     Windows of one horizon k; ``observations`` is a dict of such tensors for Dict observations.
 
-    :param observations: (batch, k + 1, ...), or (batch, len(offsets), ...) where offsets were asked for
+    :param observations: (batch, k + 1, ...), or (batch, len(offsets), ...) where offsets are given
     :param actions: (batch, k, action_dim), scaled to [-1, 1] as SB3 stores them
     :param rewards: (batch, k, 1)
     """
@@ -48,34 +49,30 @@ class NoWindowError(ValueError):
     """No episode in the buffer is long enough for the horizon yet."""
 
 
+def _map(function: Callable[[Any], Any], observations: Any) -> Any:
+    """The same function of observations, or of every part of Dict observations."""
+    if isinstance(observations, dict):
+        return {key: function(part) for key, part in observations.items()}
+    return function(observations)
+
+
+@dataclass
 class _Observations:
-    """
-    Looks like SB3's array (buffer_size, n_envs, *shape) of observations, which its own code reads; each read gathers them.
+    """SB3's array (buffer_size, n_envs, ...) of observations of one key, or of the next ones, as its own code reads it."""
 
-    :param buffer: The buffer
-    :param key: Key of Dict observations, else ""
-    :param following: Whether these are the next observations
-    """
-
-    def __init__(self, buffer: "WindowReplayBuffer", key: str, following: bool):
-        self.buffer = buffer
-        self.key = key
-        self.following = following
-        store = buffer.stores[key]
-        self.shape = (buffer.buffer_size, buffer.n_envs, *store.shape)
-        self.dtype = store.dtype
-
-    def __len__(self) -> int:
-        return self.shape[0]
+    buffer: "WindowReplayBuffer"
+    key: str
+    following: bool
 
     def __getitem__(self, index: Any) -> np.ndarray:
         index = index if isinstance(index, tuple) else (index,)
         if any(part is Ellipsis or part is None for part in index):
             return self[:][index]
-        grid = np.broadcast_arrays(*np.ogrid[: self.shape[0], : self.shape[1]])
+        grid = np.broadcast_arrays(*np.ogrid[: self.buffer.buffer_size, : self.buffer.n_envs])
         positions, envs = (np.asarray(part[index[:2]]) for part in grid)
-        observations = self.buffer.gather(self.key, positions, envs, self.following).cpu().numpy()
-        return observations[(*(slice(None),) * positions.ndim, *index[2:])]
+        observations = self.buffer.gather(positions, envs, self.following)
+        part = observations[self.key] if isinstance(observations, dict) else observations
+        return part.cpu().numpy()[(*(slice(None),) * positions.ndim, *index[2:])]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:], dtype)
@@ -99,7 +96,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
     :param n_steps: Number of steps of n-step returns in ``sample``; only 1 for Dict observations, as in SB3
     :param gamma: Discount of n-step returns
     :param frame_stack: How many frames the environment stacks along the first axis of an observation, oldest first
-        (channels of images, which SB3 puts first); one number, or one for each key of a Dict. At an episode's begin
+        (channels of images, which SB3 puts first); one number, or one for each key of a Dict. At an episode's start
         the first frame may be repeated (Gymnasium's FrameStackObservation) or zeros may fill up (SB3's VecFrameStack)
     :param storage_device: Device that observations are stored on, such as ``"cuda"``: they are then gathered and cropped
         there. None for main memory. 100,000 frames of 100 x 100 x 3 bytes take 3 GB
@@ -130,22 +127,20 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self.gamma = gamma
 
         parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
-        if isinstance(frame_stack, Mapping) and not set(frame_stack) <= set(parts):
-            raise ValueError(f"frame_stack={dict(frame_stack)} names keys that observations do not have: {sorted(parts)}")
-        self._image_keys = frozenset(image_spaces(observation_space))
+        stacks = frame_stack if isinstance(frame_stack, Mapping) else dict.fromkeys(parts, frame_stack)
+        if not set(stacks) <= set(parts):
+            raise ValueError(f"frame_stack={dict(stacks)} names keys that observations do not have: {sorted(parts)}")
+        self._image_keys = list(image_spaces(observation_space))
         storage_device = get_device(storage_device or "cpu")
         self.stores: dict[str, FrameStore] = {}
         for key, space in parts.items():
-            stack = frame_stack.get(key, 1) if isinstance(frame_stack, Mapping) else frame_stack
-            shape = get_obs_shape(space)
-            assert isinstance(shape, tuple)
+            shape: Any = get_obs_shape(space)
+            stack = stacks.get(key, 1)
             self.stores[key] = FrameStore(key, self.buffer_size, n_envs, shape, space.dtype, stack, storage_device)
         needed = sum(store.frames.nbytes for store in self.stores.values())
         if psutil is not None and storage_device.type == "cpu" and needed > psutil.virtual_memory().available:
             # As SB3 does: memory is taken as it fills, which may be hours later.
-            warnings.warn(
-                f"This system does not have enough memory for a replay buffer of {needed / 1e9:.2f} GB", stacklevel=2
-            )
+            warnings.warn(f"There is not enough memory for a replay buffer of {needed / 1e9:.2f} GB", stacklevel=2)
 
         size = (self.buffer_size, n_envs)
         self.actions = np.zeros((*size, self.action_dim), self._maybe_cast_dtype(action_space.dtype))
@@ -158,8 +153,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
 
     def reset(self) -> None:
         """Forget everything."""
-        super().reset()
-        self.n_added = 0  # transitions per env ever added; number n is at position n % buffer_size
+        self._count(0)
         self._last_next_obs: dict[str, np.ndarray] = {}
         self._episode_over = np.ones(self.n_envs, bool)
 
@@ -179,32 +173,34 @@ class WindowReplayBuffer(NStepReplayBuffer):
 
     def gather(
         self,
-        key: str,
         positions: np.ndarray,
         envs: np.ndarray,
         following: bool | np.ndarray = False,
+        env: VecNormalize | None = None,
         crop_size: int | None = None,
-    ) -> th.Tensor:
+    ) -> Any:
         """
-        Observations of one key.
+        Observations.
 
-        :param key: Key of Dict observations, else ""
         :param positions: Positions in the buffer; like envs not checked
         :param envs: Envs, one for each position, or of a shape that broadcasts to theirs
-        :param following: Whether to give the next observation instead; (...) is what it and positions broadcast to
+        :param following: Whether to return the next observation instead; (...) is what it and positions broadcast to
+        :param env: VecNormalize, which normalizes whole images: they are not cropped
         :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
-        :return: (..., *observation shape), height and width those of the crop, on ``storage_device``
+        :return: (..., *observation shape), height and width those of the crop; a dict for Dict observations
         """
-        places = positions * self.n_envs + envs
+        indices = positions * self.n_envs + envs
         # Positions before self.pos were written in this round of the ring, the others in the round before.
         numbers = self.n_added - self.pos + positions - np.where(positions < self.pos, 0, self.buffer_size)
-        return self.stores[key].gather(
-            places,
-            numbers + following,
-            self.ages.take(places) + following,
-            self.ended.take(places) & following,
-            crop_size if key in self._image_keys else None,
-        )
+        ages, final = self.ages.take(indices) + following, self.ended.take(indices) & following
+        crops = dict.fromkeys(self._image_keys, crop_size) if env is None else {}
+        parts = {
+            key: store.gather(indices, numbers + following, ages, final, crops.get(key)) for key, store in self.stores.items()
+        }
+        observations: Any = parts if isinstance(self.observation_space, spaces.Dict) else parts[""]
+        if env is not None:
+            observations = env.normalize_obs(_map(lambda part: part.cpu().numpy(), observations))
+        return _map(lambda part: th.as_tensor(part, device=self.device), observations)
 
     def add(  # type: ignore[override]
         self,
@@ -246,12 +242,13 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self.timeouts[pos] = [self.handle_timeout_termination and info.get("TimeLimit.truncated", False) for info in infos]
         self._last_next_obs = {key: value.copy() for key, value in following.items()}
         self._episode_over = np.zeros(self.n_envs, bool)
-        self.n_added += 1
-        self.pos += 1
-        if self.pos == self.buffer_size:
-            self.full = True
-            self.pos = 0
+        self._count(self.n_added + 1)
         self._end_episodes(done)
+
+    def _count(self, n_added: int) -> None:
+        self.n_added = n_added  # transitions per env ever added; number n is at position n % buffer_size
+        self.pos = n_added % self.buffer_size
+        self.full = n_added >= self.buffer_size
 
     def _end_episodes(self, envs: np.ndarray) -> None:
         """The last transitions of these envs (n_envs,) are the last of their episodes."""
@@ -314,9 +311,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
             if state[name] != getattr(self, name):
                 raise ValueError(f"the state is of a replay buffer with {name}={state[name]}, not {getattr(self, name)}")
         self.reset()
-        self.n_added = state["n_added"]
-        self.pos = self.n_added % self.buffer_size
-        self.full = self.n_added >= self.buffer_size
+        self._count(state["n_added"])
         for name, values in state["arrays"].items():
             getattr(self, name)[: len(values)] = values.cpu().numpy()
         for key, store in self.stores.items():
@@ -331,9 +326,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
         Transitions, uniform over all; the same as those of SB3's buffers for one seed.
 
         :param batch_size: Number of transitions
-        :param env: VecNormalize that observations and rewards go through; it normalizes whole images, which are not cropped
+        :param env: VecNormalize that observations and rewards go through
         :param crop_size: Height and width in pixels that images are cropped to at random while their frames are gathered,
-            each observation at a place of its own; None for no crop. n-step returns come without crops
+            each observation at a position of its own; None for no crop. n-step returns come without crops
         """
         positions = np.random.randint(0, self.size(), size=batch_size)
         return self._get_samples(positions, env, **({} if crop_size is None else {"crop_size": crop_size}))
@@ -346,34 +341,15 @@ class WindowReplayBuffer(NStepReplayBuffer):
             return super()._get_samples(batch_inds, env)
         envs = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
         # Observations and next ones together.
-        both = self._gather_all(batch_inds, envs, np.array([[False], [True]]), env, crop_size)
-        is_dict = isinstance(both, dict)
-        obs, next_obs = ({key: value[i] for key, value in both.items()} if is_dict else both[i] for i in range(2))
+        both = self.gather(batch_inds, envs, np.array([[False], [True]]), env, crop_size)
         dones = self.dones[batch_inds, envs] * (1 - self.timeouts[batch_inds, envs])
-        return (DictReplayBufferSamples if is_dict else ReplayBufferSamples)(
-            obs,  # type: ignore[arg-type]
+        return (DictReplayBufferSamples if isinstance(both, dict) else ReplayBufferSamples)(
+            _map(lambda part: part[0], both),
             self.to_torch(self.actions[batch_inds, envs]),
-            next_obs,  # type: ignore[arg-type]
+            _map(lambda part: part[1], both),
             self.to_torch(dones[:, None]),
             self.to_torch(self._normalize_reward(self.rewards[batch_inds, envs][:, None], env)),
         )
-
-    def _gather_all(
-        self,
-        positions: np.ndarray,
-        envs: np.ndarray,
-        following: np.ndarray,
-        env: VecNormalize | None,
-        crop_size: int | None,
-    ) -> Any:
-        """Observations as ``gather`` returns them, of all keys, normalized, on the device."""
-        crop_size = crop_size if env is None else None
-        parts = {key: self.gather(key, positions, envs, following, crop_size).to(self.device) for key in self.stores}
-        if env is not None:
-            arrays: dict[str, Any] = {key: part.cpu().numpy() for key, part in parts.items()}
-            normalized: Any = self._normalize_obs(arrays.get("", arrays), env)
-            parts = {key: self.to_torch(part) for key, part in (normalized if "" not in arrays else {"": normalized}).items()}
-        return parts.get("", parts)
 
     def _draw_windows(self, batch_size: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
         """Positions of the last steps, and envs, of windows, uniform over all whole ones."""
@@ -392,8 +368,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         else:
             whole = self.ages[: self.size()] >= horizon - 1
             if self.full:
-                oldest = np.arange(min(horizon - 1, self.buffer_size))
-                whole[(self.pos + oldest) % self.buffer_size] = False
+                whole[(self.pos + np.arange(horizon - 1)) % self.buffer_size] = False
             every = np.flatnonzero(whole)
             if not len(every):
                 raise NoWindowError(f"no episode in the replay buffer spans {horizon} agent steps yet")
@@ -430,49 +405,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
         # The last observation is the next one of the last step: the episode may have ended there.
         following = wanted == horizon
         # Gathered one offset after the other, so that all observations at some of the offsets are contiguous.
-        observations = self._gather_all(steps[:, wanted - following].T, envs, following[:, None], env, crop_size)
+        observations = self.gather(steps[:, wanted - following].T, envs, following[:, None], env, crop_size)
         return WindowSamples(
-            {key: value.transpose(0, 1) for key, value in observations.items()}
-            if isinstance(observations, dict)
-            else observations.transpose(0, 1),
+            _map(lambda part: part.transpose(0, 1), observations),
             self.to_torch(self.actions[steps, envs[:, None]]),
             self.to_torch(self._normalize_reward(self.rewards[steps, envs[:, None], None], env)),
         )
-
-
-def _gymnasium_stack(env: VecEnv) -> int:
-    try:
-        stack = env.get_attr("stack_size")[0] if all(env.env_is_wrapped(FrameStackObservation)) else 1
-    except (NotImplementedError, AttributeError):
-        return 1  # a VecEnv that does not report what it is made of
-    return stack if isinstance(stack, int) else 1  # of a wrapper outside of it
-
-
-def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
-    """
-    How many frames an environment stacks along the first axis of observations, by its wrappers.
-
-    :param env: Vectorized environment, images transposed as SB3's algorithms do
-    :return: The size of SB3's VecFrameStack, else of Gymnasium's FrameStackObservation; for Dict observations by key.
-        1 without them, where the first axis is not a multiple of it, where VecFrameStack took the last axis, and where a
-        wrapper outside of it has given observations other keys
-    """
-    space = env.observation_space
-    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    outer = unwrap_vec_wrapper(env, VecFrameStack)
-    inner: dict[str, Any] = {}
-    if isinstance(outer, VecFrameStack):
-        # The frames of VecFrameStack are all that is stacked inside of it.
-        stack = outer.stacked_obs.n_stack
-        inner = getattr(outer.stacked_obs, "sub_stacked_observations", {"": outer.stacked_obs})
-    else:
-        stack = _gymnasium_stack(env)
-    stacks: dict[str, int] = {}
-    for key, part in parts.items():
-        shape = part.shape or (1,)
-        stacked = inner.get(key)
-        # A wrapper outside may have taken one of several observations, whose key is not known any more.
-        is_known = not inner or stacked is not None
-        first_axis = stacked is None or stacked.channels_first or len(shape) == 1 or is_image_space(part)
-        stacks[key] = stack if is_known and first_axis and shape[0] % stack == 0 else 1
-    return stacks if isinstance(space, spaces.Dict) else stacks[""]

@@ -4,6 +4,10 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
+from gymnasium.wrappers import FrameStackObservation
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 
 def rows_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -54,7 +58,7 @@ class FrameStore:
         self.frame_shape = (shape[0] // stack, *shape[1:]) if stack > 1 else shape
         # Zeros of NumPy take memory as they are written to, those of PyTorch at once.
         self.frames = th.from_numpy(np.zeros((buffer_size + stack, n_envs, *self.frame_shape), self.dtype)).to(device)
-        self.final_frames: dict[int, th.Tensor] = {}  # by place in (buffer_size, n_envs), one row after the other
+        self.final_frames: dict[int, th.Tensor] = {}  # by flat index in (buffer_size, n_envs)
         self.zero_padded = np.zeros((buffer_size, n_envs), bool)  # whether zeros came before an episode's first frame
 
     def __getstate__(self) -> dict[str, Any]:
@@ -118,7 +122,7 @@ class FrameStore:
         :param starts: (n_envs,), whether the observation begins an episode
         """
         for env in range(self.n_envs):
-            self.final_frames.pop(self._place(number, env), None)
+            self.final_frames.pop(self._index(number, env), None)
         old, new = self.split(observations), self.split(next_observations)
         for row, frames in ((number, old), (number + 1, new)):
             self.frames[row % len(self.frames)] = th.from_numpy(np.array(frames[:, -1], self.dtype))
@@ -134,42 +138,42 @@ class FrameStore:
         :param envs: (n_envs,), whether the episode is over
         """
         for env in np.flatnonzero(envs).tolist():
-            self.final_frames[self._place(number, env)] = self.frames[(number + 1) % len(self.frames), env].clone()
+            self.final_frames[self._index(number, env)] = self.frames[(number + 1) % len(self.frames), env].clone()
 
-    def _place(self, number: int, env: int) -> int:
+    def _index(self, number: int, env: int) -> int:
         return number % self.buffer_size * self.n_envs + env
 
     def gather(
-        self, places: np.ndarray, newest: np.ndarray, age: np.ndarray, final: np.ndarray, crop_size: int | None = None
+        self, indices: np.ndarray, newest: np.ndarray, age: np.ndarray, final: np.ndarray, crop_size: int | None = None
     ) -> th.Tensor:
         """
         Stacked observations; all arrays broadcast to the shape (...) of ``newest``.
 
-        :param places: Places of their transitions in (buffer_size, n_envs), one row after the other
+        :param indices: Flat indices of their transitions in (buffer_size, n_envs)
         :param newest: Number of the transition whose row holds the newest frame
         :param age: How many frames of the same episode came before the newest one
         :param final: Whether the newest frame is stored separately
-        :param crop_size: Height and width in pixels that each observation is cropped to, at a place of its own, uniform
-            over all; the frames of a stack stay together. None for no crop
+        :param crop_size: Height and width in pixels that each observation is cropped to, at a random position of
+            its own; the frames of a stack stay together. None for no crop
         :return: (..., *shape), height and width those of the crop, on ``device``
         """
-        places, age, final = (np.broadcast_to(array, newest.shape) for array in (places, age, final))
+        indices, age, final = (np.broadcast_to(array, newest.shape) for array in (indices, age, final))
         back = np.arange(self.stack)[::-1]
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
-        numbers = th.from_numpy(rows * self.n_envs + places[..., None] % self.n_envs)
+        numbers = th.from_numpy(rows * self.n_envs + indices[..., None] % self.n_envs)
         if crop_size is None:
             frames = self.frames.flatten(0, 1).index_select(0, numbers.flatten().to(self.device))
         else:
             top, left = (th.randint(length - crop_size + 1, newest.shape) for length in self.frame_shape[1:])
             frames = self._crops(numbers, top, left, crop_size)
         stacked = frames.view(*numbers.shape, *frames.shape[1:])
-        # Few are at an episode's end or begin.
+        # Few are at an episode's end or start.
         for index in map(tuple, np.argwhere(final).tolist()):
-            frame = self.final_frames[int(places[index])]
+            frame = self.final_frames[int(indices[index])]
             if crop_size is not None:
                 frame = frame[:, top[index] : top[index] + crop_size, left[index] : left[index] + crop_size]
             stacked[(*index, -1)] = frame
-        padded = (back > age[..., None]) & self.zero_padded.take(places)[..., None]
+        padded = (back > age[..., None]) & self.zero_padded.take(indices)[..., None]
         for index in map(tuple, np.argwhere(padded).tolist()):
             stacked[index] = 0
         return stacked.flatten(newest.ndim, newest.ndim + 1) if self.stack > 1 else stacked.squeeze(newest.ndim)
@@ -200,7 +204,7 @@ class FrameStore:
         finals = list(self.final_frames.values()) or [th.empty(self.frame_shape, dtype=frames.dtype)]
         return {
             "frames": frames,
-            "final_places": th.tensor(list(self.final_frames), dtype=th.int64),
+            "final_indices": th.tensor(list(self.final_frames), dtype=th.int64),
             "final_frames": th.stack(finals)[: len(self.final_frames)].cpu(),
             "zero_padded": th.from_numpy(self.zero_padded[:n_added]),
         }
@@ -211,5 +215,38 @@ class FrameStore:
         """
         self.frames[: len(state["frames"])] = state["frames"]
         self.zero_padded[: len(state["zero_padded"])] = state["zero_padded"].cpu().numpy()
-        pairs = zip(state["final_places"].tolist(), state["final_frames"].to(self.device), strict=True)
-        self.final_frames = {place: frame.clone() for place, frame in pairs}
+        pairs = zip(state["final_indices"].tolist(), state["final_frames"].to(self.device), strict=True)
+        self.final_frames = {index: frame.clone() for index, frame in pairs}
+
+
+def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
+    """
+    How many frames an environment stacks along the first axis of observations, by its wrappers.
+
+    :param env: Vectorized environment, images transposed as SB3's algorithms do
+    :return: The size of SB3's VecFrameStack, else of Gymnasium's FrameStackObservation; for Dict observations by key.
+        1 without them, where the first axis is not a multiple of it, where VecFrameStack took the last axis, and where a
+        wrapper outside of it has given observations other keys
+    """
+    space = env.observation_space
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    outer = unwrap_vec_wrapper(env, VecFrameStack)
+    inner: dict[str, Any] = {}
+    if isinstance(outer, VecFrameStack):
+        # The frames of VecFrameStack are all that is stacked inside of it.
+        stack = outer.stacked_obs.n_stack
+        inner = getattr(outer.stacked_obs, "sub_stacked_observations", {"": outer.stacked_obs})
+    else:
+        try:
+            stack = env.get_attr("stack_size")[0] if all(env.env_is_wrapped(FrameStackObservation)) else 1
+        except (NotImplementedError, AttributeError):
+            stack = 1  # a VecEnv that does not report what it is made of
+    stacks = dict.fromkeys(parts, 1)
+    for key, part in parts.items():
+        shape = part.shape or (1,)
+        if inner and key not in inner:
+            continue  # a wrapper outside took one of several observations: its key is not known any more
+        first_axis = not inner or inner[key].channels_first or len(shape) == 1 or is_image_space(part)
+        if first_axis and shape[0] % stack == 0:
+            stacks[key] = stack
+    return stacks if isinstance(space, spaces.Dict) else stacks[""]
