@@ -5,20 +5,18 @@ import threading
 from urllib.error import URLError
 from urllib.request import urlopen
 
-import numpy as np
 import optuna
 import optuna_dashboard
 import pytest
 from browser import open_browser, requested
 from optuna.artifacts import FileSystemArtifactStore, get_all_artifact_meta
-from optuna.trial import TrialState, create_trial
+from optuna.trial import TrialState
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution.sampler import AuxLossSampler, SearchComplete
-from search.evolution.space import distributions, loss_to_params, suggest_aux_loss
-from search.execution import workers
+from search.evolution.sampler import AuxLossSampler
+from search.evolution.space import loss_to_params, suggest_aux_loss
 from search.execution.storage import open_storage
 from search.results import dashboard
 from search.results.notation import subscripts
@@ -28,125 +26,104 @@ EVIL = "<script>document.title='owned'</script> ![x](https://example.org/x.png) 
 BASELINES = [("SAC", 90.0), ("CURL", 110.0)]
 
 
-def note_of(study, number):
-    attrs = study._storage.get_study_system_attrs(study._study_id)
-    trial_id = study.get_trials(deepcopy=False)[number]._trial_id
-    return optuna_dashboard._note.get_note_from_system_attrs(attrs, trial_id)["body"]
-
-
 @pytest.fixture
 def store(tmp_path):
     (tmp_path / "artifacts").mkdir()
     return FileSystemArtifactStore(str(tmp_path / "artifacts"))
 
 
-def finished_study(*losses, **attrs):
-    """A study in memory; each candidate stems from the one before."""
-    study = optuna.create_study(direction="maximize")
-    for number, loss in enumerate(losses):
-        parents = [number - 1] if number else []
-        trial = create_trial(
-            value=float(number),
-            params=loss_to_params(loss),
-            distributions=distributions(loss.horizon),
-            user_attrs={"stage": number + 1, "operation": "replacement", "parents": parents, **attrs},
-        )
-        study.add_trial(trial)
-    return study
-
-
 FORWARD = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 SHIFTED = AuxLoss.parse("{s_t+1, a_t+1} -> {s_t+2}")
 
 
+def start(study, loss, **attrs):
+    """A trial that runs, as the driver has it."""
+    study.enqueue_trial(loss_to_params(loss))
+    trial = study.ask()
+    assert suggest_aux_loss(trial) == loss
+    for name, value in attrs.items():
+        trial.set_user_attr(name, value)
+    return trial
+
+
+def chain(*losses, **attrs):
+    """A study whose last trial runs; each candidate descends from the one before."""
+    study = optuna.create_study(direction="maximize")
+    for number, loss in enumerate(losses):
+        parents = [number - 1] if number else []
+        trial = start(study, loss, generation=number + 1, operation="replacement", parents=parents, **attrs)
+        if number < len(losses) - 1:
+            study.tell(trial, float(number))
+    return study, trial
+
+
 def test_note_of_a_trial():
-    study = finished_study(FORWARD, SHIFTED, FORWARD, curve=[[1000, 5.25, 1.0], [2000, 7.5, 2.0]])
-    for number in range(3):
-        dashboard.annotate_trial(study, number)
-    note = note_of(study, 1)
+    study, trial = chain(FORWARD, FORWARD, SHIFTED, curve=[[1000, 5.25, 1.0], [2000, 7.5, 2.0]])
+    dashboard.annotate_trial(study, trial)
+    note = optuna_dashboard.get_note(trial)
     assert "{sₜ₊₁, aₜ₊₁} → {sₜ₊₂}" in note
     assert f"```latex\n{SHIFTED.latex()}\n```" in note
     assert f"Notation: `{SHIFTED}`" in note and f"Canonical: `{FORWARD}`" in note
-    assert "**Score:** 1.00. **Stage:** 2. **Operation:** replacement of trial 0." in note
+    assert "**Generation:** 3. **Operation:** replacement of trial 1." in note
     assert "| 1000 | 5.2 | 1.0 |" in note and "| 2000 | 7.5 | 2.0 |" in note
-    assert "| 0 | 1 | replacement | 0.0 | `{s_t, a_t} -> {s_t+1}` |" in note
-    assert "canonical form" in note_of(study, 0) and "Lineage" not in note_of(study, 0)
-    ancestors = [line.split(" |")[0] for line in note_of(study, 2).splitlines() if "replacement" in line and line[0] == "|"]
+    assert "| 1 | 2 | replacement 0 | 1.0 | `{s_t, a_t} -> {s_t+1}` |" in note
+    ancestors = [line.split(" |")[0] for line in note.splitlines() if "replacement" in line and line[0] == "|"]
     assert ancestors == ["| 1", "| 0"]
+    study, trial = chain(FORWARD)
+    trial.report(7.0, 400)  # one of several seeds is not finished yet
+    dashboard.annotate_trial(study, trial)
+    note = optuna_dashboard.get_note(trial)
+    assert "canonical form" in note and "Lineage" not in note and "| 400 | 7.0 | - |" in note
 
 
 def test_notes_stay_small():
     """All tokens of the longest horizon, many ancestors, many evaluations."""
     longest = AuxLoss(10, (True,) * 31, (True,) * 31)
-    study = finished_study(*[longest] * 40, curve=[[step, 1000.0, 100.0] for step in range(1, 1002)], reason="x" * 10_000)
-    dashboard.annotate_trial(study, 39)
-    note = note_of(study, 39)
+    study, trial = chain(*[longest] * 20, curve=[[step, 1000.0, 100.0] for step in range(1, 1002)], reason="x" * 10_000)
+    dashboard.annotate_trial(study, trial)
+    note = optuna_dashboard.get_note(trial)
     assert len(note) < 5000
-    assert "| 1001 | 1000.0 | 100.0 |" in note and "more ancestors" in note
+    assert "| 1001 | 1000.0 | 100.0 |" in note and "7 more ancestors" in note
     assert note.count(" | 1000.0 | ") <= 20
 
 
 def test_trial_without_a_loss():
     study = optuna.create_study()
-    study.add_trial(create_trial(state=TrialState.FAIL, user_attrs={"reason": EVIL, "operation": EVIL}))
-    dashboard.annotate_trial(study, 0)
-    note = note_of(study, 0)
-    assert "no valid loss" in note and "**State:** fail" in note
+    trial = study.ask()
+    for name in ("reason", "operation"):
+        trial.set_user_attr(name, EVIL)
+    dashboard.annotate_trial(study, trial)
+    note = optuna_dashboard.get_note(trial)
+    assert "no valid loss" in note and "Reason of the failure" in note
     assert "<script>" not in note and "![x](" not in note and "\n# " not in note
 
 
-def test_who_died_gets_a_note_too(store):
-    study = finished_study(FORWARD, SHIFTED)
-    for number in (2, 3):
-        trial = study.ask(distributions(1))
-        trial.report(7.0, 400)
-        dashboard.annotate_trial(study, number, store)
-        assert "**State:** begun" in note_of(study, number)
-    workers.fail(study, study.trials[2], "its worker died")
-    dashboard.annotate_ended(study, store)
-    assert "**State:** begun" in note_of(study, 3)  # it runs
-    note = note_of(study, 2)
-    assert "**State:** fail" in note and "**Reason:** its worker died" in note and "| 400 | 7.0 | - |" in note
-    dashboard.save_note(dashboard._noted(study, study.trials[2]), "changed")
-    dashboard.annotate_ended(study, store)
-    assert note_of(study, 2) == "changed"
-
-
-def test_picture_is_uploaded_once_for_each_length_of_the_curve(store, tmp_path):
-    study = optuna.create_study(sampler=AuxLossSampler(seed=0))  # others may propose what is no valid loss
-    trial = study.ask()
-    suggest_aux_loss(trial)
-
-    def pictures():
-        return len(list((tmp_path / "artifacts").iterdir()))
-
-    dashboard.annotate_trial(study, trial.number, store)
-    assert pictures() == 0
-    for length, expected in ((1, 1), (1, 1), (2, 2)):
+def test_one_picture_that_grows_with_the_curve(store, tmp_path):
+    study = optuna.create_study()
+    trial = start(study, FORWARD)
+    pictures = set()
+    for length in (0, 1, 1, 2):
         trial.set_user_attr("curve", [[1000 * (step + 1), 1.0, 0.0] for step in range(length)])
-        dashboard.annotate_trial(study, trial.number, store)
-        assert pictures() == expected
-    assert {meta.filename for meta in get_all_artifact_meta(trial)} == {"learning-curve-1000.png", "learning-curve-2000.png"}
-    trial.set_user_attr("curve", [[3000, 1.0, 0.0]])
-    study.tell(trial, 1.0)
-    for _ in range(2):  # Optuna lets nobody write to a finished trial; the picture is its own in the dashboard all the same
-        dashboard.annotate_trial(study, study.trials[0], store)
-        assert pictures() == 3
-    path = note_of(study, 0).partition("![Learning curve](")[2].partition(")")[0]
-    assert path.startswith(f"/artifacts/{study._study_id}/{study.trials[0]._trial_id}/")
-    assert (tmp_path / "artifacts" / path.rpartition("/")[2]).read_bytes().startswith(b"\x89PNG")
+        dashboard.annotate_trial(study, trial, store)
+        files = list((tmp_path / "artifacts").iterdir())
+        assert len(files) == min(length, 1)
+        pictures |= {file.read_bytes() for file in files}
+    assert len(pictures) == 2 and all(picture.startswith(b"\x89PNG") for picture in pictures)
+    (meta,) = get_all_artifact_meta(trial)
+    path = optuna_dashboard.get_note(trial).partition("![Learning curve](")[2].partition(")")[0]
+    assert path.startswith("/artifacts/") and path.endswith(f"/{meta.artifact_id}") and files[0].name == meta.artifact_id
 
 
 def test_note_of_the_study():
     study = optuna.create_study(study_name="cheetah_run")
-    dashboard.annotate_study(study, {"stages": 7, "a|b": EVIL}, {"commit": "abc123+changes"})
+    dashboard.annotate_study(study, {"generations": 7, "a|b": EVIL}, {"commit": "abc123+changes"})
     note = optuna_dashboard.get_note(study)
-    assert "cheetah\\_run" in note and "| stages | 7 |" in note and "abc123\\+changes" in note
+    assert "cheetah\\_run" in note and "| generations | 7 |" in note and "abc123\\+changes" in note
     assert "<script>" not in note and "a\\|b" in note
 
 
 def test_plot_is_replaced():
-    study = finished_study(FORWARD, SHIFTED)
+    study, _ = chain(FORWARD, SHIFTED)
     for baselines in (BASELINES, []):
         dashboard.update_plots(study, baselines)
         attrs = study._storage.get_study_system_attrs(study._study_id)
@@ -164,25 +141,19 @@ def test_served_to_this_machine_only(monkeypatch, tmp_path):
 
 
 def search_in_miniature(storage, store):
-    """A finished search of two stages with a failed trial, annotated while and after the trials ran."""
-    sampler = AuxLossSampler(population_size=6, n_random=4, n_prior=2, seed=0, n_stages=2)
+    """A finished search of two generations with a failed trial, annotated as its driver does."""
+    sampler = AuxLossSampler(population_size=6, n_random=4, n_prior=2, seed=0, n_generations=2)
     study = optuna.create_study(storage=storage, study_name="miniature", direction="maximize", sampler=sampler)
-
-    def objective(trial):
+    while sampler.free_slots(study):
+        trial = study.ask()
         loss = suggest_aux_loss(trial)
+        dashboard.annotate_trial(study, trial, store)
         score = 100.0 - 5 * loss.horizon + trial.number
         trial.set_user_attr("curve", [[1000, score / 2, 3.0], [2000, score, 4.0]])
         if trial.number == 2:
             trial.set_user_attr("reason", EVIL)
-            raise FloatingPointError
-        if trial.number % 2:
-            dashboard.annotate_trial(study, trial.number, store)
-        return score
-
-    with pytest.raises(SearchComplete):
-        study.optimize(objective, n_trials=30, catch=(FloatingPointError,))
-    for trial in study.get_trials(deepcopy=False)[:13]:
         dashboard.annotate_trial(study, trial, store)
+        study.tell(trial, *([None, TrialState.FAIL] if trial.number == 2 else [score]))
     dashboard.annotate_study(study, {"environment": "dm_control/cheetah-run-v0", "remark": EVIL}, {"commit": "abc123"})
     dashboard.update_plots(study, BASELINES)
     return study
@@ -196,10 +167,10 @@ def reachable(url):
 
 
 def read_trial(browser):
-    """What a trial's page shows, read in one go because it is drawn anew now and then; None until its picture is there."""
+    """What a trial's page shows, read in one go because it is redrawn now and then; None until its picture is there."""
     return browser.execute_script("""
         const picture = document.querySelector("img[alt='Learning curve']");
-        if (!picture || picture.naturalWidth != 640) return null;
+        if (!picture || picture.naturalWidth != 768) return null;
         return {
             text: document.body.innerText,
             heading: document.querySelector("h3").innerText,
@@ -210,6 +181,7 @@ def read_trial(browser):
     """)
 
 
+@pytest.mark.slow
 def test_in_a_real_browser(tmp_path, store):
     storage = open_storage(tmp_path)
     study = search_in_miniature(storage, store)
@@ -236,7 +208,7 @@ def test_in_a_real_browser(tmp_path, store):
         points = f"[id='{plot_id}'] .scatterlayer .trace:first-child .points path"
         wait.until(lambda _: len(browser.find_elements(By.CSS_SELECTOR, points)) == len(completed))
         plot = browser.find_element(By.ID, plot_id).text
-        assert all(name in plot for name in ("Evolution of auxiliary losses", "Stage", "SAC", "CURL"))
+        assert all(name in plot for name in ("Evolution of auxiliary losses", "Generation", "SAC", "CURL"))
 
         browser.get(f"{url}/dashboard/studies/{study._study_id}/note")
         wait.until(lambda _: "dm_control/cheetah-run-v0" in text())
@@ -256,26 +228,8 @@ def test_in_a_real_browser(tmp_path, store):
             curve = trial.user_attrs["curve"]
             assert {f"{steps} {mean:.1f} {std:.1f}" for steps, mean, std in curve} <= set(rows)
             for ancestor in lineage(trial, trials):
-                assert any(row.startswith(f"{ancestor.number} {ancestor.user_attrs['stage']} ") for row in rows)
+                assert any(row.startswith(f"{ancestor.number} {ancestor.user_attrs['generation']} ") for row in rows)
         assert " ".join(EVIL.split()) in page["text"]
         assert browser.title != "owned"
         assert [address for address in requested(browser) if not address.startswith(url)] == []
         assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
-
-
-def test_a_note_is_cheap_in_a_long_study(tmp_path):
-    """What a note costs the storage does not grow with the study: a few attributes, whatever there is already."""
-    rng = np.random.default_rng(0)
-    losses = [AuxLoss(10, (True, *(rng.random(30) < 0.5)), (*(rng.random(30) < 0.5), True)) for _ in range(30)]
-    study = optuna.create_study(storage=open_storage(tmp_path), direction="maximize")
-    study.add_trials(finished_study(*losses, curve=[[1000, 1.0, 0.5]]).trials)
-    journal = tmp_path / "journal.log"
-
-    def written(number):
-        before = journal.stat().st_size
-        dashboard.annotate_trial(study, number)
-        return journal.stat().st_size - before
-
-    sizes = [written(number) for number in range(30)]
-    assert max(sizes) < 15_000
-    assert max(sizes[15:]) < 1.5 * max(sizes[:15])
