@@ -16,8 +16,8 @@ DATABASE := postgresql
 demo: $(VENV)/.installed
 	$(BIN)/aarl search zoo_configs/search/demo.yml --workers 2
 	$(BIN)/aarl cross-validate zoo_configs/search/demo.yml --workers 2
-	$(BIN)/aarl train cheetah-run --config zoo_configs/demo.yml --aux-loss runs/demo/winner.yml --out runs/demo/winner
-	$(BIN)/aarl report runs/demo --config zoo_configs/search/demo.yml
+	$(BIN)/aarl train cheetah-run --config zoo_configs/demo.yml --aux-loss runs/demo/winner.yml --folder runs/demo/winner
+	$(BIN)/aarl report runs/demo
 
 test: $(VENV)/.installed-dev system
 	$(BIN)/python -m pytest -n 2

@@ -38,7 +38,7 @@ Top = Annotated[int, Option(help="How many of the best candidates the metrics ar
 
 
 def read_config(path: Path, **changes: Any) -> "SearchConfig":
-    """The configuration of a search, with the values of options that are not None over those of the file; its runs can start."""
+    """The configuration of a search, with the values of options over those of its file; that its runs can start is checked."""
     from search.studies.config import load_config
     from search.studies.search import make_run
     from search.training.run import check_run
@@ -81,8 +81,10 @@ def open_studies(
     for folder in folders:
         path = search_folder(folder, storage)
         opened = open_storage(path, storage, create=False)
-        # Without a name, the study is called like the folder.
-        found += [(load_study(opened, name or (path.name if path else None)), path or Path()) for name in names]
+        for name in names:
+            # Studies and folders are called alike, unless both are named.
+            study = load_study(opened, name or (path.name if path else None))
+            found.append((study, path or Path("runs") / study.study_name))
     alike = len({study.study_name for study, _ in found}) < len(found)
     studies = {str(path) if alike else study.study_name: (study, path) for study, path in found}
     if len(studies) < len(found):

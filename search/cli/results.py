@@ -133,13 +133,18 @@ def report(
     folder: options.SearchFolder = None,
     storage: Storage = None,
     study: options.StudyName = None,
-    config: Annotated[
-        Path | None, typer.Option(help="Configuration of the search. Default: the settings in the note of its study.")
-    ] = None,
     benchmark: Annotated[Path | None, typer.Option(help="Folder of a benchmark whose tables and curves it shows too.")] = None,
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
     """Write a report of a search as one HTML file."""
+    from search.results.report import stored_baselines, stored_runs, write_report
+    from search.training.provenance import provenance
+
+    ((searched, path),) = open_studies([folder], storage, [study]).values()
+    out = out or path / "report.html"
+    runs = stored_runs(path / "cross-validation")
+    write_report(searched, out, stored_baselines(path), None, provenance(), runs, benchmark)
+    say(f"Report: {out}")
 
 
 @app.command()
@@ -152,11 +157,17 @@ def dashboard(
     port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
 ) -> None:
     """Watch a search in optuna-dashboard."""
-    from search.execution.storage import open_storage
-    from search.results.dashboard import ARTIFACTS, serve
+    from search.execution.storage import load_study, open_storage
+    from search.results.dashboard import ARTIFACTS, serve, update_plots
+    from search.results.report import stored_baselines
+    from search.studies.search import SETTINGS_KEY
 
     path = search_folder(folder, storage)
     opened = open_storage(path, storage, create=False)
+    for name in (found.study_name for found in opened.get_all_studies()):
+        study = load_study(opened, name)
+        if SETTINGS_KEY in study.user_attrs:  # a search; baselines may have been trained since its last plot
+            update_plots(study, stored_baselines(path or Path("runs") / name))
     say(f"http://{host}:{port}/  (Ctrl-C to stop)")
     with suppress(KeyboardInterrupt):
         serve(opened, (path or Path("runs")) / ARTIFACTS, host, port)

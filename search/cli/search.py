@@ -53,11 +53,16 @@ def search(
     if executor == "local" and (named := [name for name, value in of_ray.items() if value is not None]):
         raise ValueError(f"--{named[0]} needs --executor ray")
 
+    from optuna import logging
+
     from search.execution.driver import Driver
     from search.execution.runs import LocalExecutor
     from search.execution.storage import hide_password, open_storage
+    from search.results.dashboard import update_plots
+    from search.results.report import stored_baselines
     from search.studies.search import open_search, runs_of
 
+    logging.set_verbosity(logging.WARNING)
     settings = read_config(config, threads=threads, generations=generations, pruner=pruner)
     path = run_folder(config, folder)
     opened = open_storage(path, storage)
@@ -79,6 +84,7 @@ def search(
     )
     with running, closing(progresses):
         shown = show_progress(progresses)
+    update_plots(study, stored_baselines(path))
     if shown is not None and shown.best is not None:
         say(f"Best: {shown.best_loss}, score {shown.best:.2f}")
 
@@ -86,7 +92,8 @@ def search(
 def annotations(study: "Study", config: "SearchConfig", folder: Path) -> "Callable[[Trial], None]":
     """Write the note of a study; the function that is returned keeps the notes of its trials and its plot up to date."""
     from search.results.dashboard import annotate_study, annotate_trial, artifacts, update_plots
-    from search.studies.search import baseline_scores, settings
+    from search.results.report import stored_baselines
+    from search.studies.search import settings
     from search.training.provenance import provenance
 
     annotate_study(study, settings(config), provenance())
@@ -95,10 +102,10 @@ def annotations(study: "Study", config: "SearchConfig", folder: Path) -> "Callab
 
     def annotate(trial: "Trial") -> None:
         nonlocal drawn
-        annotate_trial(study, trial.number, pictures)
+        annotate_trial(study, trial, pictures)
         if time.monotonic() - drawn > PLOT_SECONDS:
             drawn = time.monotonic()
-            update_plots(study, baseline_scores(config, folder))
+            update_plots(study, stored_baselines(folder))
 
     return annotate
 
