@@ -56,6 +56,7 @@ def commands(text: str) -> list[str]:
     return [line for block in re.findall(r"```bash\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
 
 
+@pytest.mark.slow
 def test_readme_of_planted_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = [Path("zoo_configs") / f"{name}.yml" for name in ("aarl_state", "sac_dense_mlp")]
     folder = tmp_path / "results" / "planted"

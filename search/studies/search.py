@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,13 @@ from optuna.trial import TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
 from search.evolution.sampler import AuxLossSampler
-from search.execution.matrix import Cell, Matrix, scores
+from search.execution.matrix import Cell, Matrix
 from search.studies.config import SearchConfig
 from search.training.run import Run
 
-# User attribute of a study: what decides the scores of its candidates.
-SETTINGS_KEY = "settings"
-# Settings that change no score.
-SCORELESS = ("n_timesteps", "device")
+SETTINGS_KEY = "settings"  # user attribute of a study
+# Settings that may change when a search is resumed.
+FREE = ("n_timesteps", "device", "n_generations", "pruner")
 
 
 def make_run(
@@ -86,14 +86,10 @@ def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Stud
         direction="maximize",
         load_if_exists=True,
     )
-    difference = _difference(study, config)
-    if difference is not None:
-        raise ValueError(
-            f"study {study.study_name!r} is not this search: {difference}. Another search needs a file of another name, or "
-            "another storage"
-        )
-    sampler.free_slots(study)  # refuses a study that was started with other settings of the sampler
-    study.set_user_attr(SETTINGS_KEY, _run_settings(config))
+    if difference := _difference(study, config):
+        advice = "Another search needs a file of another name, or another storage"
+        raise ValueError(f"study {study.study_name!r} is not this search: {difference}. {advice}")
+    study.set_user_attr(SETTINGS_KEY, settings(config))
     return study, sampler
 
 
@@ -117,56 +113,35 @@ def baselines(config: SearchConfig, folder: Path) -> Matrix:
     :param config: The search
     :param folder: Folder of the search; the runs are in its folder ``baselines``
     """
-    runs = {
-        Cell(baseline.name, config.environment, seed): make_run(
-            config, config.environment, baseline.aux_loss, seed, baseline.overrides
-        )
-        for seed in config.seeds
-        for baseline in config.baselines
-    }
+    environment, runs = config.environment, {}
+    for seed, baseline in product(config.seeds, config.baselines):
+        run = make_run(config, environment, baseline.aux_loss, seed, baseline.overrides)
+        runs[Cell(baseline.name, environment, seed)] = run
     return Matrix(f"{config.name}-baselines", folder / "baselines", runs)
-
-
-def baseline_scores(config: SearchConfig, folder: Path) -> list[tuple[str, float]]:
-    """
-    Name and mean score of the baselines that have finished runs.
-
-    :param config: The search
-    :param folder: Folder of the search
-    """
-    means = scores(baselines(config, folder)).groupby("variant")["score"].mean()
-    return [(str(name), float(score)) for name, score in means.items()]
 
 
 def settings(config: SearchConfig) -> dict[str, Any]:
     """
-    What notes and reports show of a search: the settings of its runs and of its sampler, in plain values.
+    All that decides the losses and the scores of a search, in plain values as they are read from JSON.
 
     :param config: The search
     """
-    sampler = config.sampler_settings()
-    sampler["initial"] = [str(loss) for loss in sampler["initial"]]
-    return json.loads(json.dumps({**_run_settings(config), **sampler, "pruner": config.pruner}))
-
-
-def _run_settings(config: SearchConfig) -> dict[str, Any]:
-    """All that decides the score of a loss, as read from JSON, and the seed of the search."""
-    run = make_run(config, config.environment, None, config.seeds[0]).model_dump(mode="json")
-    hyperparameters = run.pop("hyperparameters")
-    names = ("environment", "checkpoints", "evaluation_episodes", "threads", "imports")
-    return {**{name: run[name] for name in names}, "seeds": list(config.seeds), "seed": config.seed, **hyperparameters}
+    run = make_run(config, config.environment, None, config.seed)
+    values = run.model_dump(exclude={"aux_loss", "hyperparameters", "keep_model"}) | config.sampler_settings()
+    values |= {"initial": [str(loss) for loss in values["initial"]], "seeds": config.seeds, "pruner": config.pruner}
+    return json.loads(json.dumps(values | run.hyperparameters))
 
 
 def _difference(study: optuna.Study, config: SearchConfig) -> str | None:
     """The first thing that makes a study another one than that of a search."""
     if study.directions != [StudyDirection.MAXIMIZE]:
         return f"its directions are {[direction.name.lower() for direction in study.directions]}, not one to maximize"
-    stored, asked = study.user_attrs.get(SETTINGS_KEY), _run_settings(config)
+    stored, wanted = study.user_attrs.get(SETTINGS_KEY), settings(config)
     if stored is None:
         has_trials = any(trial.state != TrialState.WAITING for trial in study.get_trials(deepcopy=False))
         return "it has trials of another program" if has_trials else None
-    for key in stored | asked:
-        old, new = stored.get(key), asked.get(key)
-        if old != new and key not in SCORELESS:
+    for key in stored | wanted:
+        old, new = stored.get(key), wanted.get(key)
+        if old != new and key not in FREE:
             return f"it was started with {key}={old!r}, not {new!r}"
     return None
