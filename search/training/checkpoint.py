@@ -111,29 +111,20 @@ def load(model: SACAux, state: Mapping[str, Any]) -> None:
     :param model: The model, with the same settings
     :param state: As returned by :func:`read`
     """
-    env = model.get_env()
-    assert env is not None and isinstance(model.replay_buffer, WindowReplayBuffer)
+    assert isinstance(model.replay_buffer, WindowReplayBuffer)
     model.load_training_state(state["model"])
     model.replay_buffer.load_training_state(state["replay_buffer"])
-    # VecNormalize learns from every reset, so learn() must not reset: these observations are never used.
-    model._last_obs = env.reset()  # type: ignore[assignment]
-    normalization = model.get_vec_normalize_env()
-    if normalization is not None:
-        model._last_original_obs = normalization.get_original_obs()
-        for name, values in state["normalization"].items():
-            statistics = getattr(normalization, name)
-            statistics.mean, statistics.var = values["mean"].numpy(), values["var"].numpy()
-            statistics.count = values["count"]
+    for name, (mean, var, count) in state["normalization"].items():
+        statistics = getattr(model.get_vec_normalize_env(), name)
+        statistics.mean, statistics.var, statistics.count = mean.numpy(), var.numpy(), count
 
 
 def _normalization_state(env: VecNormalize | None) -> dict[str, Any]:
-    state = {}
-    for name in ("obs_rms", "ret_rms"):
-        if hasattr(env, name):
-            statistics = getattr(env, name)
-            mean, var = (th.as_tensor(np.array(value)) for value in (statistics.mean, statistics.var))
-            state[name] = {"mean": mean, "var": var, "count": float(statistics.count)}
-    return state
+    found = {name: getattr(env, name) for name in ("obs_rms", "ret_rms") if hasattr(env, name)}
+    return {
+        name: (th.as_tensor(statistics.mean), th.as_tensor(statistics.var), float(statistics.count))
+        for name, statistics in found.items()
+    }
 
 
 def remove(folder: Path) -> None:
@@ -154,29 +145,42 @@ class CheckpointCallback(BaseCallback):
     :param seed: Seed of the run
     :param curve: The learning curve, which ``LearningCurveCallback`` appends to
     :param on_save: Called after each checkpoint; training ends if it returns False
+    :param state: The checkpoint from which the run is resumed
     """
 
     model: SACAux
 
-    def __init__(self, folder: Path, seed: int, curve: list[Evaluation], on_save: Callable[[], bool]):
+    def __init__(
+        self,
+        folder: Path,
+        seed: int,
+        curve: list[Evaluation],
+        on_save: Callable[[], bool],
+        state: Mapping[str, Any] | None = None,
+    ):
         super().__init__()
         self.folder = folder
         self.seed = seed
         self.curve = curve
         self.on_save = on_save
         self.stopped = False
+        self._state = state
         self._n_saved = len(curve)
-        self._restart = bool(curve)  # of a resumed run
+
+    def _on_training_start(self) -> None:
+        # Not before learn(), which resets the environment, and VecNormalize learns from that.
+        if self._state is not None:
+            load(self.model, self._state)
 
     def _on_rollout_start(self) -> None:
-        if len(self.curve) > self._n_saved:
+        is_due = len(self.curve) > self._n_saved
+        if is_due:
             save(self.folder, self.model, self.curve)
             self._n_saved = len(self.curve)
             self.stopped = not self.on_save()
-            self._restart = True
-        if self._restart:
+        if is_due or self._state is not None:
             restart(self.model, self.seed)
-            self._restart = False
+            self._state = None
 
     def _on_step(self) -> bool:
         return not self.stopped

@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import functools
-import importlib
 import json
 import logging
 import math
@@ -25,7 +24,7 @@ from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, read_curve, replace_text, write_curve
 from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
 from search.training import checkpoint
-from search.training.config import VEC_ENVS, ConfigError, action_repeat, check_hyperparameters, validated
+from search.training.config import VEC_ENVS, ConfigError, action_repeat, check_hyperparameters, import_modules, validated
 from search.training.provenance import add_session, read_about, write_about
 
 logger = logging.getLogger(__name__)
@@ -188,8 +187,7 @@ def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int
 
 def _make_in_process(imports: Sequence[str], env_id: str, env_kwargs: Mapping[str, Any], steps: Sequence[int] = ()) -> gym.Env:
     """An environment in a process of its own, perhaps, where nothing is imported yet."""
-    for module in imports:
-        importlib.import_module(module)
+    import_modules(imports)
     return checkpoint.TruncateAt(make_env(env_id, env_kwargs), steps)
 
 
@@ -203,15 +201,13 @@ class _Setup:
 
     def __init__(self, run: Run, path: str):
         self.run = run
-        for module in run.imports:
-            importlib.import_module(module)
+        import_modules(run.imports)
         settings = check_hyperparameters(run.hyperparameters, run.environment, path)
         self.action_repeat, interval = action_repeat(settings), checkpoint_interval(settings)
         for steps in run.checkpoints:
             if steps % interval:
-                raise ConfigError(
-                    f"{path}: checkpoint {steps} is no multiple of {interval} environment steps (train_freq x n_envs x action repeat)"
-                )
+                problem = f"is no multiple of train_freq x n_envs x action repeat, {interval} environment steps"
+                raise ConfigError(f"{path}: checkpoint {steps} {problem}")
         settings.pop("n_timesteps", None)
         self.env_kwargs: dict[str, Any] = settings.pop("env_kwargs", None) or {}
         self.pixels = self.env_kwargs.get("pixels", False)
@@ -226,6 +222,12 @@ class _Setup:
             # The same run with a smaller checkpoint; each environment has an equal share of the buffer.
             settings["buffer_size"] = min(settings["buffer_size"], math.ceil(self.agent_steps / self.n_envs) * self.n_envs)
         self.settings = settings | {"aux_loss": run.aux_loss, "seed": run.seed}
+
+        limit = EPISODE_LENGTH if run.environment.startswith(PREFIX) else gym.spec(run.environment).max_episode_steps
+        apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
+        if limit is not None and apart < limit * self.n_envs:
+            message = "evaluations are %d environment steps apart, and truncate episodes, which may have %d"
+            logger.warning(message, apart // self.n_envs, limit)
 
     def _make(self, *args: Any, **kwargs: Any) -> Callable[[], gym.Env]:
         return functools.partial(_make_in_process, self.run.imports, self.run.environment, self.env_kwargs, *args, **kwargs)
@@ -258,15 +260,6 @@ class _Setup:
 
         :param env: What :meth:`training_env` returns
         """
-        spec = env.get_attr("spec")[0]
-        episode = EPISODE_LENGTH if self.run.environment.startswith(PREFIX) else spec and spec.max_episode_steps
-        apart = min(after - before for before, after in zip((0, *self.run.checkpoints), self.run.checkpoints, strict=False))
-        if episode and apart // self.n_envs < episode:
-            logger.warning(
-                "evaluations are %d environment steps apart, an episode may have %d: it is truncated at each evaluation",
-                apart // self.n_envs,
-                episode,
-            )
         return SACAux(self.policy, env, **self.settings)
 
 
@@ -339,10 +332,6 @@ def _train(
     trained = curve[-1].environment_steps if curve else 0
     with _closing(setup.training_env(trained)) as env, _closing(setup.evaluation_env()) as evaluation_env:
         model = setup.model(env)
-        if state:
-            checkpoint.load(model, state)
-            logger.info("the run is resumed after %d environment steps", trained)
-        del state
         evaluations = LearningCurveCallback(
             evaluation_env,
             run.checkpoints,
@@ -358,9 +347,9 @@ def _train(
             return goes_on and not (folder / STOP).exists()
 
         add_session(folder, _description(run), aux_loss=str(model.aux_loss), device=str(model.device), threads=run.threads)
-        checkpoints = checkpoint.CheckpointCallback(folder, run.seed, evaluations.curve, report)
-        remaining = setup.agent_steps - model.num_timesteps
-        model.learn(remaining, [evaluations, checkpoints], reset_num_timesteps=False, progress_bar=progress_bar)
+        checkpoints = checkpoint.CheckpointCallback(folder, run.seed, evaluations.curve, report, state)
+        del state  # mapped from a file that will be replaced
+        model.learn(setup.agent_steps, [evaluations, checkpoints], progress_bar=progress_bar)
         if not checkpoints.stopped:
             if run.keep_model:
                 unfinished = folder / f"unfinished-{MODEL}"
