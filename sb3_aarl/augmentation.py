@@ -15,13 +15,13 @@ def _check_crop(images: th.Tensor, size: int) -> None:
 
 def _cut(images: th.Tensor, top: th.Tensor, left: th.Tensor, height: int, width: int) -> th.Tensor:
     """Of image i, ``height`` x ``width`` pixels from row ``top[i]`` and column ``left[i]`` on."""
-    views = images.unfold(2, height, 1).unfold(3, width, 1)  # every place at once, nothing copied yet
+    views = images.unfold(2, height, 1).unfold(3, width, 1)  # all positions at once, nothing copied yet
     return views[th.arange(len(images), device=images.device), :, top, left]
 
 
 def random_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
     """
-    Crop every image to ``size`` x ``size`` at a place of its own, uniform over all; the frames of a stack stay together.
+    Crop every image to ``size`` x ``size`` at a random position of its own; the frames of a stack stay together.
 
     :param images: (batch, channels, height, width), any dtype
     :param size: Height and width in pixels of what is kept

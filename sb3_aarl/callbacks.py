@@ -46,11 +46,10 @@ def aulc(curve: Sequence[Evaluation]) -> float:
 
 class SingleEpisodes(gym.Wrapper):
     """
-    One episode for each ``reset(seed=...)``, and nothing is simulated after it.
+    One episode for each ``reset(seed=...)``, and nothing is simulated after it: for ``LearningCurveCallback``.
 
-    For ``LearningCurveCallback``, which seeds every episode. SB3's vectorized environments reset an environment as soon as
-    its episode ends, and step it until all others have ended theirs. Here that costs nothing: until the next seed, the
-    environment stays at its last observation.
+    SB3's vectorized environments reset an environment as soon as its episode ends, and step it until all others have ended
+    theirs. Here that costs nothing: until the next seed, the environment stays at its last observation.
 
     :param env: The environment, ``Monitor`` included
     """
@@ -80,20 +79,19 @@ class LearningCurveCallback(BaseCallback):
     Evaluate with deterministic actions at fixed environment steps (paper, A.2: 10 episodes).
 
     Episode i of evaluation k is that of ``reset(seed=seed + 1000 * k + i)``, so that runs can be compared and a resumed run
-    draws the same initial states. As many episodes run at once as there are evaluation environments, with one prediction
-    for all. How many changes the last bits of actions, as matrix products of other sizes round differently, and simulations
-    with contacts make much of little: compare runs that are evaluated with equally many. The last checkpoint may be the end
-    of training.
+    has the same initial states. As many episodes run at once as there are evaluation environments, with one prediction for
+    all. Their number changes the last bits of actions, as matrix products of other sizes round differently, and contacts
+    amplify them: compare runs that are evaluated with equally many. The last checkpoint may be the end of training.
 
     :param eval_env: Environment to evaluate on, not the one that is trained on. A VecEnv, such as
         ``make_vec_env(make_dmc_env, 10, wrapper_class=SingleEpisodes, env_kwargs=...)``, has at most ``n_eval_episodes``
     :param checkpoints: Environment steps (agent steps x action repeat) at which to evaluate, ascending
     :param n_eval_episodes: Episodes of each evaluation
-    :param action_repeat: Environment steps of one agent step, None to ask the environment's wrappers
+    :param action_repeat: Environment steps of one agent step, None for that of the environment's wrappers
     :param seed: Seed of the initial states
     :param path: CSV file that the curve is written to after every evaluation, None for no file
     :param on_evaluation: Called after each evaluation; training stops if it returns False
-    :param curve: Evaluations that were made before, of a run that goes on
+    :param curve: Evaluations before this run was resumed
     :param verbose: 1 prints each evaluation
     :raises ValueError: when the checkpoints are not ascending, or lie between two agent steps, or a VecEnv is too large
     """
@@ -124,8 +122,6 @@ class LearningCurveCallback(BaseCallback):
         for checkpoint in self.checkpoints:
             if checkpoint % action_repeat:
                 raise ValueError(f"checkpoint {checkpoint} is no multiple of the action repeat {action_repeat}")
-        if n_eval_episodes < 1:
-            raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
         if eval_env.num_envs > n_eval_episodes:
             raise ValueError(f"eval_env has {eval_env.num_envs} environments, more than n_eval_episodes={n_eval_episodes}")
         self.n_eval_episodes = n_eval_episodes
@@ -140,16 +136,14 @@ class LearningCurveCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         # With several environments, or a resumed run, one step may pass more than one checkpoint.
-        goes_on = True
-        while goes_on and self._is_due():
-            goes_on = self._evaluate()
-        return goes_on
-
-    def _is_due(self) -> bool:
-        n = len(self.curve)
-        return n < len(self.checkpoints) and self.num_timesteps * self.action_repeat >= self.checkpoints[n]
+        environment_steps = self.num_timesteps * self.action_repeat
+        while len(self.curve) < len(self.checkpoints) and environment_steps >= self.checkpoints[len(self.curve)]:
+            if not self._evaluate():
+                return False
+        return True
 
     def _evaluate(self) -> bool:
+        """One evaluation; whether training continues."""
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         returns = self._episode_returns(self.seed + 1000 * len(self.curve))
@@ -189,10 +183,10 @@ class LearningCurveCallback(BaseCallback):
 
 def replace_text(path: Path, text: str) -> None:
     """
-    Write a file in one step: others may read it, or write it too, at any time.
+    Write a file in one step: other processes may read it, or write it too, at any time.
 
     :param path: The file; its folder is made if it is not there
-    :param text: What will be in it, line ends as they are
+    :param text: Its contents, line ends as they are
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
@@ -200,7 +194,7 @@ def replace_text(path: Path, text: str) -> None:
         unfinished.write_text(text, encoding="utf-8", newline="")
         unfinished.replace(path)
     finally:
-        unfinished.unlink(missing_ok=True)  # half of it may be what fills the disk
+        unfinished.unlink(missing_ok=True)  # what is left of it on a full disk
 
 
 def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:
@@ -222,24 +216,17 @@ def read_curve(path: str | Path) -> list[Evaluation]:
     Read what :func:`write_curve` wrote.
 
     :param path: The file
-    :raises ValueError: naming the line that is not what was written
+    :raises ValueError: naming the line that is no evaluation
     """
-    curve: list[Evaluation] = []
     with Path(path).open(newline="", encoding="utf-8") as file:
-        for number, row in enumerate(csv.reader(file), start=1):
-            if number == 1:
-                if tuple(row) != Evaluation._fields:
-                    raise ValueError(f"{path} has {','.join(row)!r} in its first line, not {','.join(Evaluation._fields)!r}")
-                continue
-            types = (int, float, float, int, float)
-            try:
-                evaluation = Evaluation(*(convert(cell) for convert, cell in zip(types, row, strict=True)))
-            except ValueError:
-                raise ValueError(f"line {number} of {path} is no evaluation: {','.join(row)!r}") from None
-            if curve and evaluation.environment_steps <= curve[-1].environment_steps:
-                raise ValueError(
-                    f"line {number} of {path} is of {evaluation.environment_steps} environment steps, the one before of "
-                    f"{curve[-1].environment_steps}"
-                )
-            curve.append(evaluation)
+        header, *rows = list(csv.reader(file)) or [[]]
+    if tuple(header) != Evaluation._fields:
+        raise ValueError(f"{path} has {','.join(header)!r} in its first line, not {','.join(Evaluation._fields)!r}")
+    curve: list[Evaluation] = []
+    for number, row in enumerate(rows, start=2):
+        try:
+            steps, mean, std, episodes, seconds = row
+            curve.append(Evaluation(int(steps), float(mean), float(std), int(episodes), float(seconds)))
+        except ValueError:
+            raise ValueError(f"line {number} of {path} is no evaluation: {','.join(row)!r}") from None
     return curve

@@ -40,12 +40,12 @@ _choose_renderer()
 # software, the two copies of LLVM crash the process; in this order they do not.
 with contextlib.suppress(ImportError):
     import triton  # type: ignore[import-not-found]  # noqa: F401
-# Locomotion tasks need labmaze, which Python 3.13 has no wheel of: shimmy prints a warning at every import.
+# Locomotion tasks need labmaze, which has no wheel for Python 3.13: shimmy prints a warning at every import.
 with contextlib.redirect_stdout(None):
     import shimmy  # noqa: F401  (registers dm_control/...)
 from dm_control import suite  # noqa: E402
 
-# dm_control's models use what MuJoCo calls deprecated, and it says so each time that one is made.
+# dm_control's models use what MuJoCo has deprecated: a warning for each environment.
 logging.getLogger("absl").addFilter(lambda record: "settotalmass" not in record.getMessage())
 
 PREFIX = "dm_control/"
@@ -100,14 +100,14 @@ def make_dmc_env(
     environment steps (control steps of the suite, each some steps of MuJoCo), so 1000 / action_repeat agent steps, and ends
     by truncation.
 
-    :param env_id: Such as ``dm_control/cheetah-run-v0``; ``cheetah-run`` and the paper's ``Cheetah-Run`` will do
+    :param env_id: Such as ``dm_control/cheetah-run-v0``, ``cheetah-run`` or the paper's ``Cheetah-Run``
     :param pixels: Whether to observe rendered images, (3 * frame_stack, height, width) bytes, instead of state vectors
     :param action_repeat: Environment steps for which each action is kept
     :param frame_stack: Consecutive observations put side by side, the newest last; the first one of an episode fills up
     :param image_size: Height and width in pixels, one number for both
     :param camera_id: Number or name of the camera, None for the usual one of the domain
-    :param fast_rendering: Whether to leave out shadows, reflections and anti-aliasing: several times faster where
-        there is no GPU, but other pictures than the suite's own
+    :param fast_rendering: Whether to leave out shadows, reflections and anti-aliasing: several times faster without a GPU,
+        but other pictures than the suite's own
     :param seed: Seed of the initial states from the first ``reset()`` on, and of ``action_space``; None for a random one
     :raises ValueError: for an unknown task, with the nearest ones
     """
@@ -120,10 +120,8 @@ def make_dmc_env(
         env_id = full
     domain = env_id.removeprefix(PREFIX).partition("-")[0]
     height, width = image_size if isinstance(image_size, Sequence) else (image_size, image_size)
-    if min(height, width) < 1:
-        raise ValueError(f"image_size must be at least 1, not {image_size}")
-    render_kwargs: dict[str, Any] = {"height": height, "width": width}
-    render_kwargs["camera_id"] = CAMERAS.get(domain, 0) if camera_id is None else camera_id
+    camera_id = CAMERAS.get(domain, 0) if camera_id is None else camera_id
+    render_kwargs: dict[str, Any] = {"height": height, "width": width, "camera_id": camera_id}
     if fast_rendering:
         render_kwargs["render_flag_overrides"] = {"shadow": False, "reflection": False}
     env = gym.make(
