@@ -20,11 +20,14 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution.sampler import AuxLossSampler, SearchComplete
+from sb3_aarl.callbacks import Evaluation, write_curve
 from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+from search.execution.matrix import Cell, cell_folder
 from search.results import analysis
 from search.results.notation import mathml, subscripts
-from search.results.report import stage_rows, stored_baselines, stored_runs, time_spent, write_report
+from search.results.report import generation_table, stored_baselines, stored_runs, write_report
+from search.training.provenance import write_about
+from search.training.run import Run, prepare_run
 
 START = datetime(2026, 1, 1)
 EVIL = "<script>document.title='owned'</script><img src=https://example.org/x.png>"
@@ -56,14 +59,14 @@ def test_subscripts_read_as_the_notation(loss):
     assert AuxLoss.parse(re.sub(r"\b([sar])t", r"\1_t", plain)) == loss
 
 
-def make_trial(number, state, value, seconds, loss=None, **attrs):
+def make_trial(number, state, value, duration, loss=None, **attrs):
     loss = loss or random_loss(np.random.default_rng(number), 3)
     return FrozenTrial(
         number=number,
         state=state,
         value=value,
         datetime_start=START,
-        datetime_complete=START + timedelta(seconds=seconds) if state.is_finished() else None,
+        datetime_complete=START + timedelta(seconds=duration) if state.is_finished() else None,
         params=loss_to_params(loss),
         distributions=distributions(loss.horizon),
         user_attrs=attrs,
@@ -75,16 +78,17 @@ def make_trial(number, state, value, seconds, loss=None, **attrs):
 
 @pytest.fixture
 def study():
-    """30 trials over three stages: every fourth failed, every fifth of the others pruned, the last two run."""
+    """30 trials over three generations: every fourth failed, every fifth of the others pruned, the last two run."""
     study = optuna.create_study(study_name=f"study {EVIL}", direction="maximize")
     rng = np.random.default_rng(3)
     for number in range(30):
         state = TrialState.FAIL if number % 4 == 3 else TrialState.PRUNED if number % 5 == 4 else TrialState.COMPLETE
         state = TrialState.RUNNING if number >= 28 else state
-        stage = number // 10 + 1
-        value = float(rng.normal(100 * stage, 50)) if state == TrialState.COMPLETE else None
-        attrs = {"stage": stage, "place": number % 10 % 8, "operation": "horizon_change" if stage > 1 else "random"}
-        attrs |= {"parents": [int(rng.integers(10 * (stage - 2), 10 * (stage - 1)))] if stage > 1 else []}
+        generation = number // 10 + 1
+        value = float(rng.normal(100 * generation, 50)) if state == TrialState.COMPLETE else None
+        attrs = {"generation": generation, "operation": "horizon_change" if generation > 1 else "random"}
+        parents = [int(rng.integers(10 * (generation - 2), 10 * (generation - 1)))] if generation > 1 else []
+        attrs |= {"slot": number % 10 % 8, "attempt": 0, "parents": parents}
         attrs |= {"device": "GPU: some", "threads": 9} if number % 2 else {"device": "CPU: 2 cores", "threads": 2}
         attrs |= {"curve": [[1000, 10.0, 1.0], [2000, 20.0, 2.0]]} if number % 3 == 0 else {}
         trial = make_trial(number, state, value, 60 + number, **attrs)
@@ -109,33 +113,18 @@ def table_after(page, heading):
     return [[cell.text_content().strip() for cell in row.xpath("./td")] for row in table.xpath(".//tr[td]")]
 
 
-def test_stages_and_time(study):
-    for row in stage_rows(study):
-        of_stage = [trial for trial in study.trials if trial.user_attrs["stage"] == row.stage]
-        states = [trial.state for trial in of_stage]
-        scores = [trial.value for trial in of_stage if trial.state == TrialState.COMPLETE]
-        assert row.places == 8
-        assert row.completed == len(scores) and row.best == max(scores)
-        assert row.mean == pytest.approx(np.mean(scores))
-        assert row.failed == states.count(TrialState.FAIL) and row.pruned == states.count(TrialState.PRUNED)
-        assert row.running == states.count(TrialState.RUNNING)
-    assert [row.stage for row in stage_rows(study)] == [1, 2, 3]
-    assert time_spent(study.trials) == timedelta(seconds=sum(60 + number for number in range(28)))
-
-
-def test_places_of_a_search():
-    sampler = AuxLossSampler(population_size=3, n_random=4, n_prior=1, seed=0)
-    study = optuna.create_study(sampler=sampler, direction="minimize")
-    study.optimize(lambda trial: float(suggest_aux_loss(trial).horizon), n_trials=7)
-    rows = stage_rows(study)
-    assert [(row.places, row.completed) for row in rows] == [(5, 5), (3, 2)]
-    assert rows[0].best == min(trial.value for trial in study.trials[:5])
-    # One that is asked for when nothing is left to do has no place: no candidate of the search failed.
-    done = optuna.create_study(sampler=AuxLossSampler(n_random=2, n_prior=0, seed=0, n_stages=1), direction="minimize")
-    with pytest.raises(SearchComplete):
-        done.optimize(lambda trial: float(suggest_aux_loss(trial).horizon))
-    assert [trial.state for trial in done.trials][-1] == TrialState.FAIL
-    assert [(row.completed, row.failed) for row in stage_rows(done)] == [(2, 0)]
+def test_generations(study):
+    rows = generation_table(analysis.trial_table(study.trials))
+    assert list(rows.index) == [1, 2, 3]
+    for generation, row in rows.iterrows():
+        trials = [trial for trial in study.trials if trial.user_attrs["generation"] == generation]
+        scores = [trial.value for trial in trials if trial.state == TrialState.COMPLETE]
+        states = Counter(trial.state.name.lower() for trial in trials)
+        assert {name: row[name] for name in ("complete", "pruned", "fail", "running")} == {
+            **dict.fromkeys(row.index[:4], 0),
+            **states,
+        }
+        assert (row["lowest"], row["highest"], row["average"]) == pytest.approx((min(scores), max(scores), np.mean(scores)))
 
 
 def test_what_is_no_loss_was_not_stopped_early():
@@ -143,18 +132,17 @@ def test_what_is_no_loss_was_not_stopped_early():
     study.optimize(lambda trial: float(suggest_aux_loss(trial, 1).horizon), n_trials=40)
     states = Counter(trial.state for trial in study.trials)
     assert min(states[TrialState.PRUNED], states[TrialState.COMPLETE]) > 0
-    assert [(row.completed, row.pruned) for row in stage_rows(study)] == [(states[TrialState.COMPLETE], 0)]
+    (row,) = generation_table(analysis.trial_table(study.trials)).to_dict("records")
+    assert row["complete"] == states[TrialState.COMPLETE] and "pruned" not in row
 
 
-def test_hours_of_trials_whose_workers_died_are_not_known():
-    hours = 13
+def test_hours_of_interrupted_trials_are_not_known():
     trials = [
-        make_trial(0, TrialState.COMPLETE, 1.0, 3600 * hours, device=0, commit=["a"]),
-        make_trial(1, TrialState.FAIL, None, 3600 * hours, died=True),
+        make_trial(0, TrialState.COMPLETE, 1.0, 9, device="CPU: some", seconds=3600.0, threads=2),
+        make_trial(1, TrialState.FAIL, None, 3600, interrupted=True),
     ]
     (row,) = analysis.machines(trials).reset_index().to_dict("records")
-    assert (row["device"], row["commit"], row["trials"], row["hours"]) == ("0", "['a']", 1, hours)
-    assert time_spent(trials) == timedelta(hours=hours)
+    assert row == {"device": "CPU: some", "commit": "not noted", "trials": 1, "hours": 1.0, "core_hours": 2.0}
 
 
 def test_what_the_report_says(study, tmp_path):
@@ -166,18 +154,19 @@ def test_what_the_report_says(study, tmp_path):
     states = [trial.state for trial in study.trials]
     counts = [states.count(state) for state in (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL, TrialState.RUNNING)]
     summary = "30 trials: {} completed, {} pruned, {} failed, {} running or waiting.".format(*counts)
-    assert summary in text and "took 34 min 18 s together" in text
+    assert summary in text and "took 0.57 hours together" in text
     rows = table_after(page, "Best losses")
-    assert [row[:2] for row in rows] == [[f"{trial.value:.1f}", str(trial.number)] for trial in best[:10]]
+    assert len(rows) == 10
     for row, trial in zip(rows, best, strict=False):
-        assert row[2] == str(trial.user_attrs["stage"]) and row[3] == trial.user_attrs["operation"].replace("_", " ")
-        assert row[4] == (", ".join(map(str, trial.user_attrs["parents"])) or "–")
+        operation, parents = trial.user_attrs["operation"].replace("_", " "), ", ".join(map(str, trial.user_attrs["parents"]))
+        expected = [str(trial.number), f"{trial.value:.2f}", str(trial.user_attrs["generation"]), operation, parents or "–"]
+        assert row[1:] == expected and row[0].endswith(str(analysis.loss_of(trial)))
     parents, number = [], best[0].number
     while study.trials[number].user_attrs["parents"]:
         number = study.trials[number].user_attrs["parents"][0]
         parents.append(str(number))
     assert parents and [row[1] for row in table_after(page, "Lineage of the best")] == parents
-    assert table_after(page, "Baselines") == [["SAC & co", "150.0"]]
+    assert table_after(page, "Baselines") == [["SAC & co", "150.00"]]
     assert table_after(page, "Settings") == [["environment", EVIL]]
     assert table_after(page, "What wrote this report") == [["commit", "abc123"], ["cpu", "2 cores"]]
     assert page.xpath("//h2[normalize-space()='Learning curves']")
@@ -239,38 +228,53 @@ def test_packages_are_those_that_the_trials_were_trained_with(tmp_path):
     assert table_after(page, "What wrote this report") == [["versions", "torch 3"]]
 
 
-def test_what_other_studies_of_the_storage_add(study, tmp_path):
-    """Baselines, and the candidates of the cross-validation that have all runs."""
-    storage = optuna.storages.InMemoryStorage()
+def plant(folder, variant, environment, seed, score):
+    """A run of a matrix that was evaluated once, of two evaluations if it has no score."""
+    path = cell_folder(folder, Cell(variant, environment, seed))
+    checkpoints = (1, 2) if score is None else (1,)
+    run = Run(environment=environment, aux_loss=None, hyperparameters={}, seed=seed, checkpoints=checkpoints)
+    prepare_run(path, run)
+    write_about(path, {"variant": variant, "environment": environment, "seed": seed})
+    write_curve(path / "curve.csv", [Evaluation(1, 99.0 if score is None else score, 0.0, 1, 1.0)])
+
+
+def test_baselines_and_cross_validation_are_read_from_their_folders(study, tmp_path):
+    """Of the cross-validation, the candidates that have all runs are ranked."""
     losses = ["{s_t} -> {s_t+1}", "{s_t} -> {r_t}", "{s_t} -> {a_t}"]
-    runs = [(losses[i], f"dm_control/{env}-v0", seed, 10.0 * i + seed) for i in range(3) for env in "ab" for seed in (0, 1)]
-    of_studies = {"x-cross-validation": runs[:-1], "x-baselines": [("SAC", "a", 0, 3.0), ("SAC", "a", 1, 4.0)]}
-    for name, trials in of_studies.items():
-        other = optuna.create_study(study_name=name, storage=storage, direction="maximize")
-        for variant, env, seed, score in trials:
-            attrs = {"variant": variant, "environment": env, "seed": seed, "curve": [[1, score, 0.0]]}
-            other.add_trial(optuna.trial.create_trial(value=score, user_attrs=attrs))
-        other.add_trial(optuna.trial.create_trial(state=TrialState.FAIL))
-    assert stored_baselines(storage, "x") == [("SAC", 3.5)] and stored_baselines(storage, "y") == []
-    write_report(study, tmp_path / "report.html", validation=stored_runs(storage, "x-cross-validation"))
+    runs = [
+        (loss, f"dm_control/{env}-v0", seed, 10.0 * i + seed)
+        for i, loss in enumerate(losses)
+        for env in "ab"
+        for seed in (0, 1)
+    ]
+    for *cell, score in runs:
+        plant(tmp_path / "cross-validation", *cell, None if (*cell, score) == runs[-1] else score)
+    for seed, score in ((0, 3.0), (1, 4.0), (2, None)):
+        plant(tmp_path / "baselines", "SAC", "a", seed, score)
+    assert stored_baselines(tmp_path) == [("SAC", 3.5)] and stored_baselines(tmp_path / "nothing") == []
+    validation = stored_runs(tmp_path / "cross-validation")
+    assert sorted(validation[["variant", "environment", "seed", "score"]].itertuples(index=False, name=None)) == sorted(
+        runs[:-1]
+    )
+    write_report(study, tmp_path / "report.html", validation=validation)
     page = read_page(tmp_path / "report.html")
     rows = table_after(page, "Cross-validation")
     assert [row[0].endswith(loss) for row, loss in zip(rows, losses[1::-1], strict=True)] == [True, True]
     assert [row[1:] for row in rows] == [["10.5", "10.5", "10.5", "0.7", "4"], ["0.5", "0.5", "0.5", "0.7", "4"]]
     assert "1 without all runs are left out." in " ".join(page.text_content().split())
-    write_report(study, tmp_path / "report.html", validation=stored_runs(storage, "nothing"))
+    write_report(study, tmp_path / "report.html", validation=stored_runs(tmp_path / "nothing"))
     assert "Cross-validation" not in read_page(tmp_path / "report.html").text_content()
 
 
-def test_settings_are_those_that_the_study_has_noted(study, tmp_path):
-    noted = {"environment": "Pendulum-v1", "checkpoints": [2000, 40000], "evaluation_episodes": 3, "seeds": [0, 1]}
-    study.set_user_attr("training", {"candidates": noted})
+def test_settings_are_those_stored_with_the_study(study, tmp_path):
+    stored = {"environment": "Pendulum-v1", "checkpoints": [2000, 40000], "evaluation_episodes": 3, "seeds": [0, 1]}
+    study.set_user_attr("settings", stored)
     write_report(study, tmp_path / "report.html")
     page = read_page(tmp_path / "report.html")
     assert ["checkpoints", "[2000, 40000]"] in table_after(page, "Settings")
     text = " ".join(page.text_content().split())
     assert "trained on Pendulum-v1 and evaluated at 2,000, 40,000 environment steps with 3 episodes." in text
-    assert "mean of 2 trainings" in text
+    assert "mean of 2 runs" in text
 
 
 @pytest.mark.parametrize("curves", [{}, {"curve": [[1, 1.0, 0.0]]}])
@@ -292,23 +296,24 @@ def test_report_of_nothing(tmp_path, states):
         study.add_trial(make_trial(number, state, None, 1))
     write_report(study, tmp_path / "report.html")
     text = " ".join(read_page(tmp_path / "report.html").text_content().split())
-    expected = "No trial has a score yet." if states else "This study is empty: no trial has begun yet."
+    expected = "No trial has a score yet." if states else "This study is empty: no trial has started yet."
     assert expected in text
     assert ("1 failed, 1 running or waiting" in text) == bool(states)
     assert "Best losses" not in text
 
 
 def test_report_of_another_sampler(tmp_path):
-    """Trials without a loss, a stage or an operation have a report too; the lowest is the best here."""
+    """Trials without a loss, a generation or an operation have a report too; the lowest is the best here."""
     study = optuna.create_study(direction="minimize")
     for value in (2.0, 1.0):
         trial = study.ask({"x": FloatDistribution(0, 1)})
         study.tell(trial, value)
     write_report(study, tmp_path / "report.html")
     rows = table_after(read_page(tmp_path / "report.html"), "Best losses")
-    assert rows == [["1.0", "1", "1", "-", "–", "no loss"], ["2.0", "0", "1", "-", "–", "no loss"]]
+    assert rows == [["no loss", "1", "1.00", "1", "-", "–"], ["no loss", "0", "2.00", "1", "-", "–"]]
 
 
+@pytest.mark.slow
 def test_in_a_real_browser(study, tmp_path):
     path = tmp_path / "report.html"
     best = completed(study)
@@ -323,7 +328,7 @@ def test_in_a_real_browser(study, tmp_path):
             return len(plot.find_elements(By.CSS_SELECTOR, ".scatterlayer .trace:first-child .points path"))
 
         wait.until(lambda _: points(evolution) == len(best))
-        assert all(name in evolution.text for name in ("Stage", "Score", "SAC", "CURL"))
+        assert all(name in evolution.text for name in ("Generation", "Score", "SAC", "CURL"))
         with_curve = [trial for trial in best[:5] if "curve" in trial.user_attrs]
         assert with_curve and all(f"trial {trial.number}" in curves.text for trial in with_curve)
         wait.until(lambda _: points(curves) == 2)
@@ -346,7 +351,7 @@ def test_in_a_real_browser(study, tmp_path):
             assert picture.rect["width"] == pytest.approx(patterns.rect["width"], abs=1) and picture.rect["height"] > 200
         assert [trial.number for trial in best[:10]] == [
             int(row.find_elements(By.TAG_NAME, "td")[1].text)
-            for row in browser.find_elements(By.XPATH, "//h2[.='Best losses']/following-sibling::table[1]/tbody/tr")
+            for row in browser.find_elements(By.XPATH, "//h2[.='Best losses']/following::table[1]/tbody/tr")
         ]
         width = browser.execute_script("return [document.documentElement.scrollWidth, window.innerWidth]")
         assert width[0] <= width[1]  # nothing runs out of the page
