@@ -1,9 +1,7 @@
 """What SB3 promises for SAC holds for SACAux: spaces, images, vectorized environments, wrappers, callbacks, options."""
 
-import threading
-from collections.abc import Callable
+import warnings
 from copy import deepcopy
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -139,11 +137,9 @@ def assert_equal_parameters(first: SACAux, second: SACAux) -> None:
         VECTOR,
         spaces.Box(-1, 1, (3,), np.float64),
         spaces.Box(-10, 10, (3,), np.int64),
-        spaces.Box(0, 255, (4,), np.uint8),
         spaces.Box(-np.inf, np.inf, (2, 3)),
         spaces.Discrete(5),
         spaces.MultiDiscrete([3, 4]),
-        spaces.MultiBinary(4),
         spaces.MultiBinary((2, 3)),
         spaces.Box(-1, 1, ()),
     ],
@@ -193,12 +189,8 @@ def test_discrete_actions_are_refused(space: spaces.Space) -> None:
     ("shape", "encoded"),
     [
         ((1, 36, 36), (1, 36, 36)),
-        ((3, 64, 64), (3, 64, 64)),
-        ((3, 84, 84), (3, 84, 84)),
-        ((3, 100, 100), (3, 84, 84)),
-        ((1, 40, 60), (1, 40, 60)),
+        ((3, 40, 60), (3, 40, 60)),
         ((2, 90, 110), (2, 84, 84)),
-        ((3, 60, 120), (3, 60, 120)),
     ],
     ids=str,
 )
@@ -221,17 +213,6 @@ def test_images_of_any_size(shape: tuple[int, int, int], encoded: tuple[int, int
         centre = np.s_[:, top : top + encoded[1], left : left + encoded[2]]
         blank[centre] = image[centre]
         np.testing.assert_allclose(first.predict(blank, deterministic=True)[0], action, rtol=1e-5, atol=1e-6)
-
-
-def test_the_auxiliary_loss_trains_a_pixel_encoder() -> None:
-    model = make_model(
-        RandomEnv(image_space(3, 36, 36)),
-        policy="CnnPolicy",
-        policy_kwargs={"features_extractor_kwargs": SMALL_CNN},
-        learning_rate=0.0,
-        encoder_learning_rate=1e-3,
-    )
-    assert_aux_loss_trains_encoder(model)
 
 
 MIXED = spaces.Dict(
@@ -278,7 +259,7 @@ def test_vectorized_environments(train_freq: tuple[int, str], gradient_steps: in
     assert model._n_updates == reference._n_updates > 0
     assert model.num_timesteps == reference.num_timesteps
     assert model.replay_buffer.size() * n_envs == model.num_timesteps
-    # Each env has a sequence of its own, which shows up at its place in the buffer.
+    # Each env has a sequence of its own, which shows up at its index in the buffer.
     firsts = [RandomEnv(seed=i).reset()[0] for i in range(n_envs)]
     np.testing.assert_array_equal(model.replay_buffer.observations[0], firsts)
     batch = np.stack([VECTOR.sample() for _ in range(n_envs)])
@@ -292,7 +273,7 @@ def test_vec_normalize_reaches_the_auxiliary_loss() -> None:
     assert_all_train(model, 30)
     buffer = model.replay_buffer
     raw = buffer.observations[:30, 0]
-    assert all(space.contains(observation) for observation in raw)  # stored as the environment gave them
+    assert all(space.contains(observation) for observation in raw)  # stored as the environment returned them
 
     seen = []
     model.aux_head.register_forward_pre_hook(lambda head, inputs: seen.append(inputs[0]))
@@ -302,18 +283,6 @@ def test_vec_normalize_reaches_the_auxiliary_loss() -> None:
     for window in seen[0].observations.numpy():
         assert np.isclose(normalized, window[0], atol=1e-4).all(axis=1).any()
     np.testing.assert_allclose(seen[0].rewards, rewards, rtol=1e-4)
-
-
-def test_buffer_is_extended_with_rows_of_another() -> None:
-    model = make_model(DummyVecEnv([RandomEnv] * 2)).learn(30)
-    old, buffer = deepcopy(model.replay_buffer), model.replay_buffer
-    buffer.reset()
-    timeouts = old.timeouts[:15]
-    infos = [[{"TimeLimit.truncated": over} for over in row[:, None]] for row in timeouts]
-    buffer.extend(old.observations[:15], old.next_observations[:15], old.actions[:15], old.rewards[:15], old.dones[:15], infos)
-    assert timeouts.sum() == 2 and buffer.size() == 15
-    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
-        np.testing.assert_array_equal(getattr(buffer, name)[:15], getattr(old, name)[:15])
 
 
 @pytest.mark.parametrize("n_stack", [2, 3])
@@ -349,32 +318,8 @@ def test_n_step_returns() -> None:
     np.testing.assert_allclose(batch.rewards, (1 - batch.discounts) / (1 - 0.9), rtol=1e-5)
     lengths = np.round(np.log(batch.discounts.numpy()) / np.log(0.9)).ravel()
     assert set(lengths) == {1, 2, 3}
-    with pytest.raises(AssertionError, match="Dict observation spaces"):
+    with pytest.raises(ValueError, match="n-step returns for Dict observations"):
         make_model(RandomEnv(MIXED), "MultiInputPolicy", n_steps=3)
-
-
-class Untold(DummyVecEnv):
-    """A VecEnv of a user's own, which does not say how its environments are wrapped."""
-
-    answer: list[bool] | None = None
-
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
-        if self.answer is None:
-            raise NotImplementedError
-        return self.answer
-
-
-@pytest.mark.parametrize("answer", [None, [], [True]])
-def test_environments_that_do_not_say_how_they_are_wrapped(answer: list[bool] | None) -> None:
-    env = Untold([RandomEnv])
-    env.answer = answer
-    assert_all_train(make_model(env))
-
-
-def test_optimize_memory_usage_changes_nothing() -> None:
-    assert_equal_parameters(
-        *(make_model(optimize_memory_usage=optimize, buffer_size=25).learn(40) for optimize in (False, True))
-    )
 
 
 @pytest.mark.parametrize("use_expln", [False, True])
@@ -487,77 +432,34 @@ def test_a_network_among_the_arguments_is_copied_for_each_encoder(frozen: bool, 
         assert of_actor > 0 and 1e-4 * online < target < 0.5 * online
 
 
-THE_ONE = nn.Linear(3, 6)
+def test_an_encoder_that_critic_and_target_would_share_is_refused() -> None:
+    network = nn.Linear(3, 5)
+
+    class AroundTheOne(AroundNetwork):
+        def __init__(self, observation_space: spaces.Space):
+            super().__init__(observation_space, network)
+
+    with pytest.raises(ValueError, match="AroundTheOne shares a network between critic and target critic"):
+        make_model(policy_kwargs={"features_extractor_class": AroundTheOne})
 
 
-class AroundTheOne(AroundNetwork):
-    def __init__(self, observation_space: spaces.Space):
-        super().__init__(observation_space, THE_ONE)
-        self.last = nn.Linear(6, 6)
-
-
-@pytest.mark.parametrize("extractor", [AroundTheOne, partial(AroundNetwork, network=nn.Linear(3, 5))])
-def test_an_encoder_that_critic_and_target_would_share_is_refused(extractor: Any) -> None:
-    with pytest.raises(ValueError, match=r"Around.* gives critic and target critic the same parameters"):
-        make_model(policy_kwargs={"features_extractor_class": extractor})
-
-
-def test_a_frozen_network_may_be_shared() -> None:
-    network = nn.Linear(3, 5).requires_grad_(False)
-    before = network.weight.clone()
-    model = make_model(policy_kwargs={"features_extractor_class": partial(AroundNetwork, network=network)})
-    assert model.critic.features_extractor.network is model.critic_target.features_extractor.network is network
-    moved = moved_by_training(model, 60)
-    assert moved["encoder"] == moved["momentum encoder"] == [False, False, True, True]
-    assert th.equal(network.weight, before)
-
-
-def test_arguments_of_an_encoder_that_cannot_be_copied() -> None:
-    network = nn.utils.weight_norm(nn.Linear(3, 5))
-    kwargs = {"features_extractor_class": AroundNetwork, "features_extractor_kwargs": {"network": network}}
-    with pytest.raises(ValueError, match=r"features_extractor_kwargs\['network'\] cannot be copied, .* one of its own: Only"):
-        make_model(policy_kwargs=kwargs)
-
-    class Locked(AroundNetwork):
-        def __init__(self, observation_space: spaces.Space, lock: Any):
-            super().__init__(observation_space, nn.Linear(3, 5))
-            self.lock = lock
-
-    lock = threading.Lock()  # no network: none of anybody's own
-    kwargs = {"features_extractor_class": Locked, "features_extractor_kwargs": {"lock": lock}}
-    model = make_model(policy_kwargs=kwargs)
-    assert model.critic.features_extractor.lock is model.critic_target.features_extractor.lock is lock
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
-@pytest.mark.parametrize("space", [VECTOR, spaces.Dict({"a": VECTOR, "b": spaces.Box(-1, 1, ())})], ids=str)
-def test_an_actor_is_traced_and_exported_for_batches_of_any_size(space: spaces.Space) -> None:
-    model = make_model(RandomEnv(space), "MlpPolicy" if space is VECTOR else "MultiInputPolicy")
-
-    def batch(size: int) -> Any:
-        some = [space.sample() for _ in range(size)]
-        if isinstance(space, spaces.Dict):
-            return {key: th.as_tensor(np.array([each[key] for each in some])) for key in space}
-        return th.as_tensor(np.array(some))
+def test_an_actor_is_traced_for_batches_of_any_size() -> None:
+    model = make_model()
 
     class Deterministic(nn.Module):
         def __init__(self) -> None:
             super().__init__()
             self.actor = model.actor
 
-        def forward(self, obs: Any) -> th.Tensor:
+        def forward(self, obs: th.Tensor) -> th.Tensor:
             return self.actor(obs, deterministic=True)
 
-    traced = th.jit.trace(Deterministic(), (batch(1),))
-    several = batch(5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # tracing is deprecated, and warns of Python values
+        traced = th.jit.trace(Deterministic(), (th.rand(1, 3),))
+    several = th.rand(5, 3)
     with th.no_grad():
         th.testing.assert_close(traced(several), model.actor(several, deterministic=True))
-        if space is VECTOR:
-            size = th.export.Dim("size")
-            encoder = model.critic.features_extractor  # the distribution around the rest checks its parameters
-            exported = th.export.export(encoder, (batch(3),), dynamic_shapes=({0: size},)).module()
-            th.testing.assert_close(exported(several), encoder(several))
-            assert model.predict(np.zeros((0, 3), np.float32))[0].shape == (0, 2)
 
 
 class Doubled(DenseMLP):
@@ -567,23 +469,17 @@ class Doubled(DenseMLP):
         return 2 * super().forward(observations)
 
 
-@pytest.mark.parametrize("share", [True, False])
-def test_an_encoder_derived_from_the_packages_own(share: bool) -> None:
+def test_an_encoder_derived_from_the_packages_own() -> None:
     extractor = {"features_extractor_class": Doubled, "features_extractor_kwargs": {"features_dim": 4, "width": 3}}
-    model = make_model(policy_kwargs={**extractor, "share_features_extractor": share})
+    model = make_model(policy_kwargs=extractor)
     assert_all_train(model)
-    observations = th.as_tensor(np.stack([VECTOR.sample() for _ in range(5)]))
+    observations = th.rand(5, 3)
     encoder = model.critic.features_extractor
     with th.no_grad():
         expected = 2 * encoder.project(encoder.trunk(observations))
         th.testing.assert_close(model.critic.encode(observations), expected)
         read = model.actor.extract_features(observations, model.actor.features_extractor)
-        th.testing.assert_close(read, model.actor.projection(model.actor.features_extractor(observations)))
-    assert [type(layer) for layer in model.actor.projection.children()] == ([nn.Linear, nn.LayerNorm] if share else [])
-
-
-def test_a_features_extractor_need_not_be_a_class() -> None:
-    assert_all_train(make_model(policy_kwargs={"features_extractor_class": partial(UsersExtractor, width=4)}))
+        th.testing.assert_close(read, model.actor.projection(expected))
 
 
 @pytest.mark.parametrize("policy", [SACPolicy, CnnPolicy])
@@ -593,42 +489,6 @@ def test_policies_of_sb3_are_refused(policy: type, tmp_path: Path) -> None:
     SAC("MlpPolicy", RandomEnv(), device="cpu").save(tmp_path / "model")
     with pytest.raises(ValueError, match="policy must be MlpPolicy"):
         SACAux.load(tmp_path / "model")
-
-
-class Skip(nn.Module):
-    """x + ReLU(x)"""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.relu = nn.ReLU()
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        return x + self.relu(x)
-
-
-class Bent(Skip):
-    """ReLU(tanh(x)), whose backward pass needs what tanh gave."""
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        return self.relu(th.tanh(x))
-
-
-@pytest.mark.parametrize(
-    ("activation", "function"),
-    [
-        (nn.ReLU, lambda x: x.clamp(min=0)),
-        (Skip, lambda x: x + x.clamp(min=0)),
-        (Bent, lambda x: x.tanh().clamp(min=0)),
-    ],
-)
-def test_activation_functions_of_a_users_own(activation: type[nn.Module], function: Callable[[th.Tensor], th.Tensor]) -> None:
-    model = make_model(policy_kwargs={"activation_fn": activation})
-    assert_all_train(model, 40)
-    for network in (*model.critic.q_networks, *model.critic_target.q_networks):
-        first, _, last = network
-        inputs = th.randn(9, first.in_features)
-        with th.no_grad():
-            th.testing.assert_close(network(inputs), last(function(first(inputs))))
 
 
 def test_sb3s_cnn_as_encoder() -> None:
@@ -681,12 +541,6 @@ def test_float_images_are_augmented_too(augmentation: str, size: int) -> None:
     small = RandomEnv(spaces.Box(0, 1, (1, 40, 40)))
     with pytest.raises(ValueError, match="40 x 40 pixels are smaller than the crop"):
         make_model(small, "CnnPolicy", kwargs, augmentation="random_crop")
-
-
-def test_normalized_vectors_of_whole_numbers_that_are_stacked() -> None:
-    env = VecFrameStack(DummyVecEnv([lambda: RandomEnv(spaces.Box(0, 255, (5,), np.uint8))]), 2)
-    model = make_model(VecNormalize(env)).learn(60)
-    assert model.replay_buffer.stores[""].stack == 2 and model.replay_buffer.dones[:60].sum() > 1
 
 
 def test_float_images_of_a_dict() -> None:
