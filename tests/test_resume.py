@@ -46,7 +46,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
         "dm_control/reacher-easy-v0",
         {"env_kwargs": {"action_repeat": 20}, "n_envs": 2, "train_freq": 3, "gradient_steps": -1, "joint_optimizer": True},
     ),
-    "noise": ("Pendulum-v1", {"use_sde": True, "use_sde_at_warmup": True, "n_envs": 2, "vec_env": "subproc", "normalize": {}}),
+    "noise": ("Pendulum-v1", {"use_sde": True, "use_sde_at_warmup": True, "n_envs": 2, "normalize": {}}),
     "warm-up": ("Pendulum-v1", {"learning_starts": 70, "sde_sample_freq": 4, "use_sde": True}),
 }
 

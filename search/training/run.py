@@ -154,7 +154,8 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any]) -> gym.Env:
     """
     if env_id.startswith(PREFIX):
         return make_dmc_env(env_id, **env_kwargs)
-    return wrap_env(gym.make(env_id, render_mode="rgb_array" if env_kwargs.get("pixels") else None), **env_kwargs)
+    render_mode = {"render_mode": "rgb_array"} if env_kwargs.get("pixels") else {}
+    return wrap_env(gym.make(env_id, **render_mode), **env_kwargs)
 
 
 def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
@@ -208,13 +209,16 @@ class _Setup:
             if steps % interval:
                 problem = f"is no multiple of train_freq x n_envs x action repeat, {interval} environment steps"
                 raise ConfigError(f"{path}: checkpoint {steps} {problem}")
+        train_freq = settings.get("train_freq")
+        if isinstance(train_freq, tuple) and train_freq[1] == "episode" and train_freq[0] > 1:
+            raise ConfigError(f"{path}: train_freq must be 1 episode at most: a rollout has to end at each checkpoint")
         settings.pop("n_timesteps", None)
         self.env_kwargs: dict[str, Any] = settings.pop("env_kwargs", None) or {}
         self.pixels = self.env_kwargs.get("pixels", False)
         self.policy = settings.pop("policy", "CnnPolicy" if self.pixels else "MlpPolicy")
         self.n_envs, self.vec_env = settings.pop("n_envs", 1), VEC_ENVS[settings.pop("vec_env", "dummy")]
         normalize = settings.pop("normalize", False)
-        self.normalize: dict[str, Any] | None = {} if normalize is True else normalize or None
+        self.normalize: dict[str, Any] | None = {} if normalize is True else normalize if normalize is not False else None
         if self.normalize is not None and "gamma" in settings:  # as in RL-Zoo
             self.normalize = {"gamma": settings["gamma"], **self.normalize}
         self.agent_steps = run.checkpoints[-1] // self.action_repeat
@@ -229,8 +233,8 @@ class _Setup:
             message = "evaluations are %d environment steps apart, and truncate episodes, which may have %d"
             logger.warning(message, apart // self.n_envs, limit)
 
-    def _make(self, *args: Any, **kwargs: Any) -> Callable[[], gym.Env]:
-        return functools.partial(_make_in_process, self.run.imports, self.run.environment, self.env_kwargs, *args, **kwargs)
+    def _make(self, steps: Sequence[int] = ()) -> Callable[[], gym.Env]:
+        return functools.partial(_make_in_process, self.run.imports, self.run.environment, self.env_kwargs, steps)
 
     def training_env(self, trained: int = 0) -> VecEnv:
         """

@@ -1,0 +1,404 @@
+"""A run and its folder: what is refused, how it ends, what it leaves."""
+
+import json
+import logging
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filelock import FileLock, Timeout
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_aarl import SACAux
+from sb3_aarl.callbacks import Evaluation, read_curve
+from sb3_aarl.health import NonFiniteError
+from search.training import run as module
+from search.training.config import ConfigError
+from search.training.provenance import read_about, write_about
+from search.training.run import (
+    Outcome,
+    Run,
+    check_run,
+    checkpoint_interval,
+    is_finished,
+    make_env,
+    prepare_run,
+    read_outcome,
+    spread_checkpoints,
+    train,
+)
+
+HYPER: dict[str, Any] = {
+    "buffer_size": 1000,
+    "learning_starts": 20,
+    "batch_size": 16,
+    "predictor_width": 8,
+    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8, "width": 8}},
+    "device": "cpu",
+}
+
+
+class Walk(gym.Env):
+    """Sixteen steps from a random position, rewarded for it; after some steps, whatever ``fault`` says."""
+
+    observation_space = gym.spaces.Box(-100, 100, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    fault: Any = None
+    n_steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.x = float(self.np_random.normal())
+        self.n = 0
+        return np.array([self.x, self.n], np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        Walk.n_steps += 1
+        self.x += float(action[0])
+        self.n += 1
+        reward = self.x
+        if Walk.fault is not None and Walk.n_steps > 75:
+            reward = Walk.fault()
+        return np.array([self.x, self.n], np.float32), reward, False, self.n == 16, {}
+
+
+gym.register("Walk-v0", Walk, max_episode_steps=16)
+
+
+@pytest.fixture(autouse=True)
+def no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Walk, "fault", None)
+    monkeypatch.setattr(Walk, "n_steps", 0)
+
+
+def make_run(**changes: Any) -> Run:
+    values = {
+        "environment": "Walk-v0",
+        "aux_loss": "{s_t, a_t} -> {s_t+1}",
+        "hyperparameters": HYPER,
+        "seed": 3,
+        "checkpoints": (32, 64),
+        "evaluation_episodes": 2,
+    }
+    return Run(**{**values, **changes})
+
+
+def run_program(folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str) -> None:
+    """``python -m search.training.run`` in this process."""
+    monkeypatch.setattr(sys, "argv", ["run.py", str(folder), *options])
+    module.main()
+
+
+# The folder.
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"seed": 4}, "seed is 3 there, not 4"),
+        ({"checkpoints": (32, 96)}, r"checkpoints is \[32, 64\] there, not \[32, 96\]"),
+        ({"hyperparameters": HYPER | {"batch_size": 8}}, "hyperparameters.batch_size is 16 there, not 8"),
+        ({"hyperparameters": HYPER | {"gamma": 0.9}}, "hyperparameters.gamma is None there, not 0.9"),
+        ({"hyperparameters": HYPER | {"policy_kwargs": {"net_arch": [9]}}}, "hyperparameters.policy_kwargs.net_arch"),
+    ],
+    ids=["seed", "checkpoints", "batch_size", "gamma", "nested"],
+)
+def test_a_folder_of_another_run_is_refused(changes: dict[str, Any], key: str, tmp_path: Path) -> None:
+    prepare_run(tmp_path / "run", make_run())
+    before = (tmp_path / "run" / "run.json").read_bytes()
+    with pytest.raises(ValueError, match=f"{tmp_path}/run has another run: {key}"):
+        prepare_run(tmp_path / "run", make_run(**changes))
+    assert (tmp_path / "run" / "run.json").read_bytes() == before
+
+
+def test_the_device_may_change(tmp_path: Path) -> None:
+    prepare_run(tmp_path, make_run())
+    prepare_run(tmp_path, make_run(hyperparameters=HYPER | {"device": "auto", "n_timesteps": 5000}))
+    assert json.loads((tmp_path / "run.json").read_text())["hyperparameters"]["device"] == "auto"
+
+
+def test_a_run_is_what_it_was_when_it_was_written() -> None:
+    run = make_run(aux_loss=None, hyperparameters={"train_freq": [1, "episode"], "learning_rate": 1e-4}, imports=("math",))
+    assert Run.model_validate_json(run.model_dump_json()) == run
+
+
+# How it ends.
+
+
+def test_a_finished_run_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prepare_run(tmp_path, make_run())
+    assert read_outcome(tmp_path) is None and not is_finished(tmp_path)
+    seen: list[list[int]] = []
+    curve = train(tmp_path, on_evaluation=lambda curve: seen.append([point.environment_steps for point in curve]))
+    assert seen == [[32], [32, 64]]
+    assert read_outcome(tmp_path) == Outcome(curve, None, False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["curve.csv", "lock", "provenance.json", "run.json"]
+
+    monkeypatch.setattr(SACAux, "learn", None)
+    prepare_run(tmp_path, make_run())
+    assert train(tmp_path) == curve == read_curve(tmp_path / "curve.csv")
+
+
+def test_the_model_is_kept_and_evaluated_as_documented(tmp_path: Path) -> None:
+    """The last point of the curve, with one environment after the other."""
+    prepare_run(tmp_path, make_run(keep_model=True, hyperparameters=HYPER | {"gradient_steps": 0}))
+    curve = train(tmp_path)
+    model = SACAux.load(tmp_path / "model.zip")
+    env = make_env("Walk-v0", {})
+    returns = []
+    for i in range(2):
+        obs, _ = env.reset(seed=10_000 + 3 * 1_000_000 + 1000 * 1 + i)
+        returns.append(0.0)
+        over = False
+        while not over:
+            obs, reward, _, over, _ = env.step(model.predict(obs, deterministic=True)[0])
+            returns[-1] += float(reward)
+    assert curve[-1].mean == pytest.approx(np.mean(returns)) and curve[-1].episodes == 2
+
+    (tmp_path / "model.zip").unlink()
+    assert not is_finished(tmp_path) and read_outcome(tmp_path) is None
+
+
+@pytest.mark.parametrize("by_file", [True, False], ids=["file", "callback"])
+def test_a_run_that_is_stopped_ends_at_its_next_evaluation(by_file: bool, tmp_path: Path) -> None:
+    prepare_run(tmp_path, make_run())
+    if by_file:
+        (tmp_path / "stop").touch()
+    curve = train(tmp_path, on_evaluation=None if by_file else lambda curve: False)
+    assert [point.environment_steps for point in curve] == [32]
+    assert read_outcome(tmp_path) is None and not (tmp_path / "checkpoint.pt").exists()
+    prepare_run(tmp_path, make_run())
+    whole = train(tmp_path)
+    assert [point.environment_steps for point in whole] == [32, 64] and whole[0].mean == curve[0].mean
+
+
+def test_a_candidate_that_fails_is_not_to_be_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Walk, "fault", lambda: float("nan"))
+    prepare_run(tmp_path, make_run(checkpoints=(16, 64), evaluation_episodes=1))
+    with pytest.raises(NonFiniteError):
+        run_program(tmp_path, monkeypatch)
+    outcome = read_outcome(tmp_path)
+    assert outcome is not None and outcome.failure is not None and not outcome.retry
+    assert outcome.failure.startswith("NonFiniteError: reward") and "\n" not in outcome.failure
+    assert [point.environment_steps for point in outcome.curve] == [16]
+    assert not (tmp_path / "checkpoint.pt").exists()
+
+
+def test_an_environment_that_fails_is_retried_from_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def explode() -> float:
+        raise RuntimeError("the simulator\nexploded")
+
+    run = make_run(checkpoints=(16, 64), evaluation_episodes=1)
+    prepare_run(tmp_path / "undisturbed", run)
+    expected = train(tmp_path / "undisturbed")
+
+    prepare_run(tmp_path / "run", run)
+    monkeypatch.setattr(Walk, "n_steps", 0)
+    monkeypatch.setattr(Walk, "fault", explode)
+    with pytest.raises(RuntimeError, match="exploded"):
+        run_program(tmp_path / "run", monkeypatch)
+    outcome = read_outcome(tmp_path / "run")
+    assert outcome is not None and outcome[1:] == ("RuntimeError: the simulator exploded", True)
+    assert len(outcome.curve) == 1 and (tmp_path / "run" / "checkpoint.pt").exists()
+
+    monkeypatch.setattr(Walk, "fault", None)
+    prepare_run(tmp_path / "run", run)
+    assert read_outcome(tmp_path / "run") is None
+    run_program(tmp_path / "run", monkeypatch)
+    outcome = read_outcome(tmp_path / "run")
+    assert outcome is not None and [point[:4] for point in outcome.curve] == [point[:4] for point in expected]
+
+
+def test_a_second_process_waits_and_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prepare_run(tmp_path, make_run())
+    monkeypatch.setattr(module, "LOCK_SECONDS", 0.1)
+    with FileLock(tmp_path / "lock"):
+        with pytest.raises(Timeout):
+            train(tmp_path)
+        with pytest.raises(SystemExit, match="lock"):
+            run_program(tmp_path, monkeypatch)
+    assert read_outcome(tmp_path) is None  # that of the first one will be there
+    assert len(train(tmp_path)) == 2
+
+
+EXITS = """
+import os
+import gymnasium as gym
+from gymnasium.envs.classic_control import PendulumEnv
+
+class Exits(PendulumEnv):
+    n_steps = 0
+
+    def step(self, action):
+        Exits.n_steps += 1
+        if Exits.n_steps == 20:
+            os._exit(3)
+        return super().step(action)
+
+gym.register("Exits-v0", Exits, max_episode_steps=10)
+"""
+
+
+@pytest.mark.slow
+def test_an_environment_that_ends_its_process_leaves_no_outcome(tmp_path: Path) -> None:
+    """And the modules that register environments are found in the working directory."""
+    (tmp_path / "exits.py").write_text(EXITS)
+    prepare_run(tmp_path / "run", make_run(environment="Exits-v0", imports=("exits",), checkpoints=(10, 30)))
+    program = [sys.executable, "-m", "search.training.run", str(tmp_path / "run")]
+    assert subprocess.run(program, cwd=tmp_path, capture_output=True).returncode == 3
+    assert read_outcome(tmp_path / "run") is None
+
+
+STARTER = """
+import subprocess, sys
+subprocess.Popen([sys.executable, "-m", "search.training.run", sys.argv[1], "--end-with-stdin"], stdin=subprocess.PIPE).wait()
+"""
+
+
+@pytest.mark.slow
+def test_a_run_ends_with_its_starter(tmp_path: Path) -> None:
+    """Its process holds the lock as long as it lives."""
+    prepare_run(tmp_path, make_run(environment="Pendulum-v1", checkpoints=(200, 10**6), evaluation_episodes=1))
+    starter = subprocess.Popen(
+        [sys.executable, "-c", STARTER, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    try:
+        while not (tmp_path / "curve.csv").exists():
+            assert starter.poll() is None, starter.communicate()
+            time.sleep(0.1)
+        with pytest.raises(Timeout), FileLock(tmp_path / "lock", timeout=0.5):
+            pass
+    finally:
+        starter.kill()
+    with FileLock(tmp_path / "lock", timeout=30):
+        assert read_outcome(tmp_path) is None and (tmp_path / "checkpoint.pt").exists()
+
+
+# What it leaves, and what it is trained with.
+
+
+def test_provenance_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prepare_run(tmp_path, make_run(aux_loss="auto"))
+    write_about(tmp_path, {"variant": "ours", "environment": "Walk"})
+
+    def interrupt(curve: list[Evaluation]) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, on_evaluation=interrupt)
+    assert "seconds" not in read_about(tmp_path)
+    curve = train(tmp_path)
+    about = read_about(tmp_path)
+    assert about["variant"] == "ours" and about["environment"] == "Walk" and about["seed"] == 3
+    assert about["evaluations"] == [32, 64] and about["hyperparameters"] == HYPER and about["aux_loss"] == "auto"
+    assert about["seconds"] == curve[-1].seconds
+    for session in about["sessions"]:
+        assert session["device"] == "cpu" and session["threads"] == 1 and "->" in session["aux_loss"] and session["commit"]
+    assert len(about["sessions"]) == 2
+
+
+def test_evaluations_are_normalized_like_training_without_changing_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[VecNormalize] = []
+
+    class Watched(VecNormalize):
+        def __init__(self, *args: Any, **kwargs: Any):
+            super().__init__(*args, **kwargs)
+            made.append(self)
+
+    monkeypatch.setattr(module, "VecNormalize", Watched)
+    prepare_run(tmp_path, make_run(hyperparameters=HYPER | {"normalize": {"clip_obs": 5.0}, "gamma": 0.9}))
+    train(tmp_path)
+    training, evaluation = made
+    assert training.training and training.norm_reward and training.clip_obs == evaluation.clip_obs == 5.0
+    assert training.gamma == 0.9 and not evaluation.training and not evaluation.norm_reward
+    # Every observation up to the last evaluation was counted once: 64 steps, the first reset and that after the checkpoint.
+    assert evaluation.obs_rms.count == training.obs_rms.count == pytest.approx(66, abs=0.01)
+
+
+def test_the_replay_buffer_is_no_larger_than_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+    monkeypatch.setattr(SACAux, "learn", lambda self, *_, **__: sizes.append(self.replay_buffer.buffer_size) or 1 / 0)
+    for n_envs, size in ((1, 64), (2, 32)):
+        prepare_run(tmp_path / str(n_envs), make_run(hyperparameters=HYPER | {"n_envs": n_envs}))
+        with pytest.raises(ZeroDivisionError):
+            train(tmp_path / str(n_envs))
+        assert sizes[-1] == size
+
+
+@pytest.mark.slow
+def test_environments_in_processes_are_the_same(tmp_path: Path) -> None:
+    curves = []
+    for vec_env in ("dummy", "subproc"):
+        run = make_run(environment="Pendulum-v1", hyperparameters=HYPER | {"vec_env": vec_env}, checkpoints=(30, 60))
+        prepare_run(tmp_path / vec_env, run)
+        curves.append([point[:4] for point in train(tmp_path / vec_env)])
+    assert curves[0] == curves[1]
+
+
+# What is refused before it is trained.
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"environment": "CartPole-v1"}, r"CartPole-v1 cannot be trained with these settings: .*Box"),
+        ({"environment": "Walk-v7"}, "Walk-v7 cannot be trained with these settings: .*Walk"),
+        ({"imports": ("no_such_module",)}, "no_such_module"),
+        ({"hyperparameters": HYPER | {"batch_size": 0}}, "batch_size must be at least 1"),
+        ({"hyperparameters": HYPER | {"batch_sise": 1}}, "batch_sise"),
+        (
+            {"hyperparameters": HYPER | {"train_freq": 3, "n_envs": 2}},
+            "checkpoint 32 is no multiple of .* 6 environment steps",
+        ),
+        ({"hyperparameters": HYPER | {"env_kwargs": {"action_repeat": 5}}}, "checkpoint 32 is no multiple of .* 5 env"),
+        ({"hyperparameters": HYPER | {"train_freq": [2, "episode"]}}, "train_freq"),
+    ],
+    ids=["discrete", "unknown", "import", "value", "key", "rollout", "repeat", "episodes"],
+)
+def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
+        check_run(make_run(**changes))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("checkpoints", "n_envs", "n_warnings"), [((16, 32), 1, 0), ((16, 30), 1, 1), ((16, 32), 2, 1), ((10, 32), 1, 1)]
+)
+def test_evaluations_closer_than_an_episode(
+    checkpoints: tuple[int, ...], n_envs: int, n_warnings: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    check_run(make_run(checkpoints=checkpoints, hyperparameters=HYPER | {"n_envs": n_envs}))
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(warnings) == n_warnings and all("truncate" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize(
+    ("hyper", "interval"),
+    [
+        ({}, 1),
+        ({"train_freq": 5, "n_envs": 2, "env_kwargs": {"action_repeat": 4}}, 40),
+        ({"train_freq": (3, "step"), "n_envs": 2}, 6),
+        ({"train_freq": (1, "episode"), "env_kwargs": {"action_repeat": 4}}, 4),
+    ],
+)
+def test_a_rollout_is_an_interval(hyper: dict[str, Any], interval: int) -> None:
+    assert checkpoint_interval(hyper) == interval
+
+
+@given(st.integers(1, 10**6), st.integers(1, 30), st.integers(1, 16))
+def test_checkpoints_are_spread_equally(environment_steps: int, n: int, interval: int) -> None:
+    if environment_steps < n * interval:
+        with pytest.raises(ValueError, match=f"{environment_steps} environment steps"):
+            spread_checkpoints(environment_steps, n, interval)
+        return
+    checkpoints = spread_checkpoints(environment_steps, n, interval)
+    assert len(checkpoints) == n and {checkpoint % interval for checkpoint in checkpoints} == {0}
+    assert len({after - before for before, after in zip((0, *checkpoints), checkpoints, strict=False)}) == 1
+    assert environment_steps - n * interval < checkpoints[-1] <= environment_steps
