@@ -252,6 +252,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
 
     def _end_episodes(self, envs: np.ndarray) -> None:
         """The last transitions of these envs (n_envs,) are the last of their episodes."""
+        if not envs.any():
+            return
         self._episode_over |= envs
         self.ended[self.pos - 1, envs] = True
         for store in self.stores.values():

@@ -97,6 +97,8 @@ class FrameStore:
         :param number: Number of the transition
         :raises ValueError: naming the wrapper order
         """
+        if self.stack == 1:
+            return
         old, new = self.split(observations), self.split(next_observations)
         problems = {
             "an episode begins neither with one frame repeated nor with zeros": starts & ~self.begins(observations),
@@ -127,8 +129,9 @@ class FrameStore:
         for row, frames in ((number, old), (number + 1, new)):
             self.frames[row % len(self.frames)] = th.from_numpy(np.array(frames[:, -1], self.dtype))
         position = number % self.buffer_size
-        padded = ~rows_equal(old[:, :-1], old[:, -1:])
-        self.zero_padded[position] = np.where(starts, padded, self.zero_padded[position - 1])
+        self.zero_padded[position] = self.zero_padded[position - 1]
+        if starts.any():
+            self.zero_padded[position, starts] = ~rows_equal(old[starts, :-1], old[starts, -1:])
 
     def put_final(self, number: int, envs: np.ndarray) -> None:
         """
