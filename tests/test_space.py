@@ -15,12 +15,13 @@ from optuna.trial import FixedTrial, TrialState
 from scipy.stats import binomtest, chisquare
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution.sampler import PLACE_KEY, AuxLossSampler
+from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import (
     check_operators,
     distributions,
     forward_dynamics_prior,
     is_valid,
+    loss_of,
     loss_to_params,
     params_to_loss,
     random_loss,
@@ -178,27 +179,18 @@ def test_any_sampler_works_and_what_is_invalid_never_reaches_training(
     assert {loss.operator for loss in trained} == set(operators or ("mse",))
 
 
-@pytest.mark.parametrize("horizon", [0, 4])
-def test_an_enqueued_horizon_outside_of_the_space_is_pruned(horizon: int) -> None:
-    study = optuna.create_study()
-    study.enqueue_trial({"horizon": horizon})
-    with pytest.warns(UserWarning, match="out of range"):
-        study.optimize(lambda trial: suggest_aux_loss(trial, 3).horizon, n_trials=1)
-    assert study.trials[0].state == TrialState.PRUNED
-
-
 @pytest.mark.parametrize("sampler", [RandomSampler(seed=0), None], ids=["random", "evolution"])
 @pytest.mark.parametrize(
     ("enqueued", "name"),
     [
         ({"horizon": "two"}, "horizon"),
-        ({"horizon": 10**9}, "horizon"),
+        ({"horizon": 0}, "horizon"),
+        ({"horizon": 4}, "horizon"),
         ({"horizon": 2, "source/s_t": "yes"}, "source/s_t"),
         ({"horizon": 1, "operator": "l1"}, "operator"),
     ],
     ids=str,
 )
-@pytest.mark.filterwarnings("ignore:Fixed parameter")
 def test_an_enqueued_value_that_a_parameter_cannot_have_is_pruned(
     sampler: BaseSampler | None, enqueued: dict[str, Any], name: str
 ) -> None:
@@ -220,8 +212,8 @@ def test_an_enqueued_value_that_a_parameter_cannot_have_is_pruned(
     assert len(reasons) == 1 and name in reasons[0]
     assert study.trials[1].value == study.trials[1].params["horizon"] == 2
     if isinstance(sampler, AuxLossSampler):
-        # It is not another try of the first, and the first costs no place.
-        assert [study.trials[i].system_attrs[PLACE_KEY]["place"] for i in range(2)] == [0, 0]
+        # It is not another attempt of the first, which costs nothing.
+        assert [(trial.user_attrs["slot"], trial.user_attrs["attempt"]) for trial in study.trials] == [(0, 0), (0, 0)]
 
 
 def test_an_error_that_is_not_of_an_enqueued_value_is_raised() -> None:
@@ -245,24 +237,36 @@ def test_unknown_operators_are_named(operators: tuple[str, ...] | str, culprit: 
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("settings", "asked"),
     [
-        ({"max_horizon": 1}, "max_horizon=2, suggest_aux_loss asks for max_horizon=1"),
-        ({"max_horizon": 2}, r"operators=\('mse', 'inner'\), suggest_aux_loss asks for operators=None"),
-        ({"max_horizon": 2, "operators": ["mse", "cosine"]}, r"asks for operators=\('mse', 'cosine'\)"),
+        ({"max_horizon": 1, "operators": ["mse", "inner"]}, r"max_horizon=1 and operators=\('mse', 'inner'\)"),
+        ({"max_horizon": 2}, "max_horizon=2 and operators=None"),
+        ({"max_horizon": 2, "operators": ["mse", "cosine"]}, r"max_horizon=2 and operators=\('mse', 'cosine'\)"),
     ],
     ids=str,
 )
-def test_a_space_other_than_the_sampler_s_is_refused(settings: dict[str, Any], message: str) -> None:
+def test_a_space_other_than_the_sampler_s_is_refused(settings: dict[str, Any], asked: str) -> None:
     sampler = AuxLossSampler(max_horizon=2, operators=["mse", "inner"], seed=0)
     study = optuna.create_study(sampler=sampler)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=rf"searches max_horizon=2 and operators=\('mse', 'inner'\), not {asked}"):
         suggest_aux_loss(study.ask(), **settings)
     for max_horizon in (2, 3, 10):  # what the sampler searches is a part of it
         trial = study.ask()
-        loss = suggest_aux_loss(trial, max_horizon, ["mse", "inner"])
-        assert str(loss) == study.trials[trial.number].system_attrs[PLACE_KEY]["loss"]
+        assert suggest_aux_loss(trial, max_horizon, ["mse", "inner"]).horizon <= 2
         study.tell(trial, 0.0)
     study.enqueue_trial({"horizon": 3})  # it would become a parent, of another space
-    with pytest.raises(optuna.TrialPruned, match="between 1 and 2, not 3"):
+    with pytest.raises(optuna.TrialPruned, match="horizon was enqueued as 3"):
         suggest_aux_loss(study.ask(), 3, ["mse", "inner"])
+
+
+def test_the_loss_of_a_trial() -> None:
+    loss = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
+    params: dict[str, Any] = loss_to_params(loss)
+    for given, expected in (
+        (params, loss),
+        ({}, None),
+        ({"horizon": 1}, None),
+        (params | {"source/s_t": False}, None),
+    ):
+        space = {name: distributions(1)[name] for name in given}
+        assert loss_of(optuna.create_trial(params=given, distributions=space, value=0.0)) == expected

@@ -47,7 +47,7 @@ def test_equals_bayesian_ridge_on_the_raw_rows(n: int) -> None:
         np.testing.assert_allclose(model.root @ model.root.T, reference.sigma_, rtol=1e-5, atol=1e-6)
 
 
-def test_adding_stage_by_stage_equals_adding_at_once() -> None:
+def test_adding_generation_by_generation_equals_adding_at_once() -> None:
     losses, scores = trials(325)
     stepwise, at_once = TokenModel(10), TokenModel(10)
     for part in (slice(0, 1), slice(1, 125), slice(125, 225), slice(225, 325)):
@@ -68,7 +68,7 @@ def test_the_unit_of_the_scores_does_not_matter(factor: float, offset: float) ->
     np.testing.assert_allclose(model.root, other.root, rtol=0, atol=1e-6)
 
 
-def test_scores_that_are_not_finite_or_cannot_be_squared_are_passed_over() -> None:
+def test_scores_that_are_not_finite_or_cannot_be_squared_are_skipped() -> None:
     losses, scores = trials(50)
     model, other = TokenModel(10), TokenModel(10)
     model.add(losses[:40], list(scores[:40]))
