@@ -86,7 +86,7 @@ def unpack_tests(folder: Path, version: str) -> None:
     subprocess.run([*pip, *source_only, f"stable-baselines3=={version}"], check=True)
     with tarfile.open(next(folder.glob("*.tar.gz"))) as archive:
         for member in archive.getmembers():
-            # Without the folder that bears name and version, and without SB3's code: the installed one is tested.
+            # Without the top folder (name and version) and without SB3's code: the installed one is tested.
             member.name = member.name.partition("/")[2]
             if member.name == "pyproject.toml" or member.name.startswith("tests/"):
                 archive.extract(member, folder, filter="data")

@@ -1,5 +1,5 @@
 """
-Many trainings on one machine at once: gradient steps a second of 1, 2, 4, ... processes, and the hours of a whole search.
+Many training runs on one machine at once: gradient steps a second of 1, 2, 4, ... processes, and the hours of a whole search.
 
 Every process trains a model of its own, as ``train_step.py`` makes it, on random data for some seconds, all at the same time.
 From the total follow the hours that the gradient steps of a search take (the paper's: about 700 candidates, 500,000
@@ -47,11 +47,11 @@ def rate(setting: str, device: str, mode: str, threads: int, seconds: float) -> 
         synchronize(device)
         barrier.wait(timeout=300)
     except Exception:
-        barrier.abort()  # nobody waits for this one
+        barrier.abort()  # so that the others do not wait
         raise
     started = time.perf_counter()
     steps = 0
-    # All begin together and train for the same time: nobody has the machine to himself.
+    # All start together and train for the same time: no process has the machine to itself.
     while time.perf_counter() - started < seconds:
         model.train(20 if device == "cuda" else 2, BATCH[setting])
         synchronize(device)
@@ -104,7 +104,7 @@ def main() -> None:
                     traceback.print_exc()
                     rows.append({**row, "error": f"{type(error).__name__}: {error}"})
                     table.add_row(*map(str, row.values()), type(error).__name__, "")
-                if args.out:  # after each row: a device may be taken away
+                if args.out:  # after each row: a device may be lost
                     save_result(args.out, device=args.device, rows=rows)
     Console(width=120).print(table)
 

@@ -18,7 +18,6 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,7 @@ EPISODE = 250
 BATCH = {"state": 512, "pixels": 128}
 REFERENCE_MS, REFERENCE_GFLOPS = {"state": 107, "pixels": 1139}, 220
 TRANSITIONS = {"state": 20_000, "pixels": 2000}
-PARTS = ("drawing", "critic", "actor", "auxiliary", "targets")
+PARTS = ("sampling", "critic", "actor", "auxiliary", "targets")
 
 
 class RandomEnv(gym.Env):
@@ -112,10 +111,8 @@ def modes(device: str) -> dict[str, dict[str, Any]]:
     """The ways to run a gradient step on this device, by name."""
     ways: dict[str, dict[str, Any]] = {"fp32": {}, "bf16": {"precision": "bf16"}}
     if device == "cuda":
-        ways |= {"tf32": {"allow_tf32": True}}
-        ways |= {f"{name}, graphs": {**kwargs, "compile": "cudagraphs"} for name, kwargs in ways.items()}
         on_gpu = {"replay_buffer_kwargs": {"storage_device": "cuda"}}
-        ways |= {f"{name}, storage": {**ways[name], **on_gpu} for name in ("tf32, graphs", "bf16, graphs")}
+        ways |= {f"{name}, storage": {**kwargs, **on_gpu} for name, kwargs in ways.items()}
     return ways
 
 
@@ -179,7 +176,7 @@ def parts(model: SACAux, device: str, steps: int) -> dict[str, float]:
         for optimizer in some
         if optimizer is not None
     ]
-    methods = {"_draw": "drawing", "_update_target": "targets"}
+    methods = {"_sample": "sampling", "_update_target": "targets"}
     for name, part in methods.items():
         setattr(model, name, timed(getattr(model, name), part))
     synchronize(device)
@@ -200,7 +197,7 @@ def measure(
     for model in models.values():
         model.set_logger(configure(None, []))
         fill(model, TRANSITIONS[setting])
-        model.train(8, model.batch_size)  # allocates, warms up; both graphs are captured in the last two
+        model.train(8, model.batch_size)  # allocates, warms up
     seconds: dict[str, list[float]] = {name: [] for name in models}
     for _ in range(rounds):
         for name, model in models.items():
@@ -220,16 +217,14 @@ def measure(
             "ms": 1e3 * statistics.median(seconds[name]),
             "ratio": statistics.median(own / base for own, base in zip(seconds[name], seconds["SB3 SAC"], strict=True)),
             "rounds_ms": [1e3 * value for value in seconds[name]],
+            "gflop": flops(model) / 1e9,
+            "peak_gflops": peak(device, th.bfloat16 if bf16 else th.float32, BATCH[setting]) / 1e9,
         }
-        if getattr(model, "compile", None) is None:
-            row["gflop"] = flops(model) / 1e9
-            with model._gpu_settings() if isinstance(model, SACAux) else nullcontext():  # TF32 or not
-                row["peak_gflops"] = peak(device, th.bfloat16 if bf16 else th.float32, BATCH[setting]) / 1e9
-            row["share_of_peak"] = row["gflop"] / row["peak_gflops"] / (row["ms"] / 1e3)
-            if isinstance(model, SACAux):
-                row["parts_ms"] = parts(model, device, 2 * steps)
+        row["share_of_peak"] = row["gflop"] / row["peak_gflops"] / (row["ms"] / 1e3)
+        if isinstance(model, SACAux):
+            row["parts_ms"] = parts(model, device, 2 * steps)
         rows.append(row)
-    float32_peak = max(row.get("peak_gflops", 0) for row in rows if row["algorithm"] != "bf16")
+    float32_peak = max(row["peak_gflops"] for row in rows if row["algorithm"] != "bf16")
     for row in rows if device == "cpu" else []:
         row["ratio_to_reference"] = row["ms"] / (REFERENCE_MS[setting] * REFERENCE_GFLOPS / float32_peak)
     return rows
@@ -247,8 +242,8 @@ def show(rows: list[dict[str, Any]]) -> None:
             row["algorithm"],
             f"{row['ms']:.1f}" if row["ms"] >= 10 else f"{row['ms']:.3f}",
             f"{row['ratio']:.3f}",
-            f"{row['gflop']:.1f}" if "gflop" in row else "",
-            f"{row['share_of_peak']:.0%}" if "gflop" in row else "",
+            f"{row['gflop']:.1f}",
+            f"{row['share_of_peak']:.0%}",
             *(f"{split[part]:.2f}" if split else "" for part in PARTS),
             f"{row['ratio_to_reference']:.3f}" if "ratio_to_reference" in row else "",
         )
