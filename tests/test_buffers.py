@@ -399,7 +399,7 @@ def test_saved_and_loaded_it_is_the_same(copied, n_added):
             loaded.add(*rows)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     episodes=st.lists(EPISODES, min_size=1, max_size=2),
     capacity=st.integers(2, 14),
@@ -437,7 +437,7 @@ def test_a_restored_buffer_continues_with_new_episodes(episodes, capacity, n_add
     envs = [trajectory(env + 4, plan, stack, paddings[env], as_dict) for env, plan in enumerate(episodes)]
     for n in range(20):
         add(envs, [buffer, restored], 1)
-        if n in (0, 4, 19):
+        if n in (0, 19):
             assert_same_samples(restored, buffer)
             for horizon in (1, 3):
                 check_windows(restored, histories, horizon)
@@ -727,7 +727,7 @@ def test_detected_stacks_fit_what_the_wrappers_give(make_env, expected):
 
 # --- Crops ------------------------------------------------------------------------------------------------------------
 
-SIZE, CROP = (9, 11), 6  # 4 x 6 places
+SIZE, CROP = (9, 11), 6  # 4 x 6 positions
 
 
 def image_buffer(stack: int, as_dict: bool = False, **kwargs: Any) -> WindowReplayBuffer:
@@ -755,8 +755,8 @@ def image_buffer(stack: int, as_dict: bool = False, **kwargs: Any) -> WindowRepl
 
 def corner_of(crop: np.ndarray, image: np.ndarray) -> tuple[int, int]:
     """Where in an image a crop was cut out."""
-    places = np.ndindex(SIZE[0] - CROP + 1, SIZE[1] - CROP + 1)
-    (corner,) = [(i, j) for i, j in places if np.array_equal(image[:, i : i + CROP, j : j + CROP], crop)]
+    corners = np.ndindex(SIZE[0] - CROP + 1, SIZE[1] - CROP + 1)
+    (corner,) = [(i, j) for i, j in corners if np.array_equal(image[:, i : i + CROP, j : j + CROP], crop)]
     return corner
 
 
@@ -783,11 +783,11 @@ def test_crops_are_parts_of_what_is_drawn_without(stack, as_dict):
             corners.append(found)
         assert_same(cropped.actions, whole.actions)
         assert_same(cropped.rewards, whole.rewards)
-    # Every observation has a place of its own, uniform over all of them: of one transition, of one window's same offset.
+    # Every observation has a corner of its own, uniform over all: the two of a transition, the same offset twice.
     assert len({tuple(found[:300]) for found in corners}) == len(corners)
     windows = np.array(corners[-1]).reshape(300, 4, 2)
     assert (windows[:, 1] != windows[:, 3]).any(axis=1).mean() > 0.8
-    counts = [sum(found.count(place) for found in corners) for place in np.ndindex(4, 6)]
+    counts = [sum(found.count(corner) for found in corners) for corner in np.ndindex(4, 6)]
     assert chisquare(counts).pvalue > 1e-3
 
 

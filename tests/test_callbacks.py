@@ -65,28 +65,28 @@ def test_evaluates_at_the_checkpoints(n_envs: int, action_repeat: int, checkpoin
         return RepeatAction(Walk(), action_repeat) if action_repeat > 1 else Walk()
 
     agent_steps: list[int] = []
-    told: list[Evaluation] = []
+    reported: list[Evaluation] = []
     model = make_model(DummyVecEnv([make_env] * n_envs))
 
     def on_evaluation(evaluation: Evaluation) -> None:
         agent_steps.append(model.num_timesteps)
-        told.append(evaluation)
+        reported.append(evaluation)
 
     callback = LearningCurveCallback(make_env(), checkpoints, 2, on_evaluation=on_evaluation)
     model.learn(checkpoints[-1] // action_repeat, callback)
     assert agent_steps == at
     assert [evaluation.environment_steps for evaluation in callback.curve] == checkpoints
-    assert told == callback.curve
-    assert callback.aulc == aulc(told) == pytest.approx(sum(evaluation.mean for evaluation in told) / len(told))
-    assert all(evaluation.episodes == 2 for evaluation in told)
+    assert reported == callback.curve
+    assert callback.aulc == aulc(reported) == pytest.approx(sum(evaluation.mean for evaluation in reported) / len(reported))
+    assert all(evaluation.episodes == 2 for evaluation in reported)
 
 
-def test_seconds_go_on_where_training_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seconds_continue_with_training(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(0, 10**6, 10))
     monkeypatch.setattr("sb3_aarl.callbacks.time.monotonic", lambda: float(next(clock)))
     model, callback = make_model(Walk()), LearningCurveCallback(Walk(), [10, 20], 1)
     model.learn(10, callback)
-    next(clock)  # between trainings it does not count
+    next(clock)  # between calls of learn() it does not count
     model.learn(10, callback, reset_num_timesteps=False)
     assert [point.seconds for point in callback.curve] == [10.0, 20.0]
 
@@ -102,7 +102,7 @@ def play(model: SACAux, env: gym.Env, seed: int) -> tuple[float, int]:
     return total, steps
 
 
-@pytest.mark.parametrize("at_once", [1, 2, 3, 5])
+@pytest.mark.parametrize("at_once", [1, 3, 5])
 @pytest.mark.parametrize("wrapper", [SingleEpisodes, None], ids=["single", "plain"])
 def test_the_returns_are_those_of_seeded_episodes_however_many_run_at_once(wrapper: Any, at_once: int) -> None:
     model = make_model(Walk())
@@ -145,9 +145,8 @@ def test_on_dm_control_several_at_once_give_the_same_returns_bit_for_bit() -> No
     one = returns(make_dmc_env(**kwargs))
     np.testing.assert_allclose(one[:2], alone, atol=1e-6)  # Monitor rounds to six digits
     assert len(set(one)) == 10
-    for at_once in (3, 10):
-        eval_env = make_vec_env(make_dmc_env, at_once, env_kwargs=kwargs, wrapper_class=SingleEpisodes)
-        assert sorted(returns(eval_env)) == sorted(one)
+    eval_env = make_vec_env(make_dmc_env, 5, env_kwargs=kwargs, wrapper_class=SingleEpisodes)
+    assert sorted(returns(eval_env)) == sorted(one)
 
 
 def parameters_after(checkpoints: list[int] | None, episodes: int = 3) -> list[th.Tensor]:
@@ -162,7 +161,7 @@ def test_an_evaluation_does_not_disturb_training() -> None:
     assert all(th.equal(*pair) for pair in zip(plain, watched, strict=True))
 
 
-def test_a_resumed_curve_goes_on_with_the_same_initial_states() -> None:
+def test_a_resumed_curve_has_the_same_initial_states() -> None:
     whole_env = Walk()
     whole = LearningCurveCallback(whole_env, [10, 20, 30], 2, seed=3)
     make_model(Walk()).learn(30, whole)
@@ -179,7 +178,7 @@ def test_a_resumed_curve_goes_on_with_the_same_initial_states() -> None:
     np.testing.assert_array_equal(resumed_env.starts, whole_env.starts[4:])
 
 
-def test_training_ends_when_the_function_says_false() -> None:
+def test_training_ends_when_the_function_returns_false() -> None:
     model = make_model(Walk())
     callback = LearningCurveCallback(Walk(), [10, 20, 30], 1, on_evaluation=lambda point: point.environment_steps < 20)
     model.learn(30, callback)
@@ -207,7 +206,7 @@ def test_normalized_environments_share_their_statistics() -> None:
         ([5], {"n_eval_episodes": 0}, "n_eval_episodes"),
     ],
 )
-def test_what_does_not_fit_is_refused(checkpoints: list[int], kwargs: dict[str, int], culprit: str) -> None:
+def test_wrong_arguments_are_refused(checkpoints: list[int], kwargs: dict[str, int], culprit: str) -> None:
     with pytest.raises(ValueError, match=culprit):
         LearningCurveCallback(Walk(), checkpoints, **kwargs)
 
@@ -240,8 +239,6 @@ def test_a_curve_is_read_as_it_was_written(
     ("change", "message"),
     [
         (lambda lines: lines[1:], r"has '20000,.*' in its first line, not 'environment_steps,"),
-        (lambda lines: [*lines, lines[-1]], "line 4 of .* is of 40000 environment steps, the one before of 40000"),
-        (lambda lines: [*lines, lines[1]], "line 4 of .* is of 20000 environment steps, the one before of 40000"),
         (lambda lines: [*lines[:-1], lines[-1][:9]], "line 3 of .* is no evaluation: '40000,2.5'"),
         (lambda lines: [*lines, "60000,many,1,10,3"], "line 4 of .* is no evaluation: '60000,many,"),
     ],
