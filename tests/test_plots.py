@@ -262,25 +262,21 @@ def test_histogram_is_in_percent_of_each_study(tables):
 
 @pytest.mark.parametrize("n_studies", [1, 2])
 def test_patterns_plot_has_a_panel_for_each_column_of_table_5(tables, n_studies):
+    """Of two studies side by side, or of one and a pattern of the user's own."""
     tables = dict(list(tables.items())[:n_studies])
-    figure = patterns_plot(tables)
-    names = [*analysis.PATTERNS, *analysis.COUNTS]
+    patterns = {"my own": "{s_t} -> {r_t}"} if n_studies == 1 else dict(list(analysis.PATTERNS.items())[:2])
+    figure = patterns_plot(tables, patterns)
+    names = [*patterns, *analysis.COUNTS]
     assert len(figure.axes) == len(names) * n_studies
     for i, axes in enumerate(figure.axes):
         name, title = names[i // n_studies], list(tables)[i % n_studies]
-        row = analysis.table5(tables[title]).loc[name]
+        row = analysis.table5(tables[title], patterns).loc[name]
         assert axes.get_title().startswith(name) and (n_studies == 1 or title in axes.get_title())
         assert axes.get_title().endswith(f"n = {row['n_with']:.0f} with, {row['n_without']:.0f} without")
         means = {line.get_label(): line.get_xdata()[0] for line in axes.lines}
         assert means["with, mean"] == row["mean_with"] and means["without, mean"] == row["mean_without"]
     assert legend_of(figure) == ["without", "with", "without, mean", "with, mean"]
     assert figure.get_suptitle().count("left out: 1 pruned, 2 failed, 1 running") == n_studies
-    check_drawing(figure)
-
-
-def test_patterns_plot_of_an_own_pattern(tables):
-    figure = patterns_plot({"Cheetah-Run": tables["Cheetah-Run"]}, {"my own": "{s_t} -> {r_t}"}, ties_without=True)
-    assert [axes.get_title().partition("\n")[0] for axes in figure.axes] == ["my own", *analysis.COUNTS]
     check_drawing(figure)
 
 
@@ -344,7 +340,8 @@ def test_learning_curves_are_means_and_deviations_over_seeds(curves):
             looks.add((line.get_linestyle(), line.get_marker()))
         assert len(looks) == 3
         assert axes.get_xlabel() == "Environment steps"
-    assert "sac: 1 seed (shade: episodes)" in figure.axes[order.index("cheetah")].get_title().replace("\n", " ")
+    title = figure.axes[order.index("cheetah")].get_title()
+    assert title == "cheetah\n1 to 4 seeds (shade of one: its episodes)"
     assert figure.axes[order.index("walker")].get_title() == "walker\n4 seeds"
     assert figure.axes[0].get_ylabel() == "Return (mean ± std)" and "aarl" in legend_of(figure)
     check_drawing(figure)
@@ -358,7 +355,7 @@ def test_many_variants_are_told_apart_and_leave_room_for_the_curves(curves):
     (axes,) = figure.axes
     # In grey too; of dashes of one's own get_linestyle() says "--" only.
     assert len({(str(line._unscaled_dash_pattern), line.get_marker()) for line in axes.lines}) == 14
-    assert axes.get_title() == "walker\n1 to 3 seeds"
+    assert axes.get_title() == "walker\n1 to 3 seeds (shade of one: its episodes)"
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # matplotlib's, that nothing is left of the axes
         check_drawing(figure)

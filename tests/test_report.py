@@ -76,7 +76,7 @@ def make_trial(number, state, value, duration, loss=None, **attrs):
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def study():
     """30 trials over three generations: every fourth failed, every fifth of the others pruned, the last two run."""
     study = optuna.create_study(study_name=f"study {EVIL}", direction="maximize")
@@ -145,10 +145,15 @@ def test_hours_of_interrupted_trials_are_not_known():
     assert row == {"device": "CPU: some", "commit": "not noted", "trials": 1, "hours": 1.0, "core_hours": 2.0}
 
 
-def test_what_the_report_says(study, tmp_path):
-    path = tmp_path / "deep" / "report.html"
+@pytest.fixture(scope="module")
+def page(study, tmp_path_factory):
+    """Its report."""
+    path = tmp_path_factory.mktemp("report") / "deep" / "report.html"
     write_report(study, path, [("SAC & co", 150.0)], {"environment": EVIL}, {"commit": "abc123", "cpu": "2 cores"})
-    page = read_page(path)
+    return read_page(path)
+
+
+def test_what_the_report_says(study, page):
     text = " ".join(page.text_content().split())
     best = completed(study)
     states = [trial.state for trial in study.trials]
@@ -185,9 +190,8 @@ PATTERNS = {
 }
 
 
-def test_table_5_of_the_report(study, tmp_path):
-    write_report(study, tmp_path / "report.html")
-    rows = {row[0]: row[1:] for row in table_after(read_page(tmp_path / "report.html"), "Patterns")}
+def test_table_5_of_the_report(study, page):
+    rows = {row[0]: row[1:] for row in table_after(page, "Patterns")}
     assert len(rows) == 8
     for name, pattern in PATTERNS.items():
         classes = {True: [], False: []}
@@ -208,9 +212,8 @@ def test_table_5_of_the_report(study, tmp_path):
     assert sum(int(row[-3]) > 1 for row in rows.values()) >= 4
 
 
-def test_machines_and_hours(study, tmp_path):
-    write_report(study, tmp_path / "report.html")
-    rows = table_after(read_page(tmp_path / "report.html"), "Machines and time")
+def test_machines_and_hours(page):
+    rows = table_after(page, "Machines and time")
     hours = [sum(60 + number for number in range(begin, 28, 2)) / 3600 for begin in (0, 1)]
     assert rows == [
         ["CPU: 2 cores", "not noted", "14", f"{hours[0]:.2f}", f"{2 * hours[0]:.2f}"],
@@ -238,7 +241,7 @@ def plant(folder, variant, environment, seed, score):
     write_curve(path / "curve.csv", [Evaluation(1, 99.0 if score is None else score, 0.0, 1, 1.0)])
 
 
-def test_baselines_and_cross_validation_are_read_from_their_folders(study, tmp_path):
+def test_baselines_and_cross_validation_are_read_from_their_folders(tmp_path):
     """Of the cross-validation, the candidates that have all runs are ranked."""
     losses = ["{s_t} -> {s_t+1}", "{s_t} -> {r_t}", "{s_t} -> {a_t}"]
     runs = [
@@ -256,6 +259,7 @@ def test_baselines_and_cross_validation_are_read_from_their_folders(study, tmp_p
     assert sorted(validation[["variant", "environment", "seed", "score"]].itertuples(index=False, name=None)) == sorted(
         runs[:-1]
     )
+    study = optuna.create_study()
     write_report(study, tmp_path / "report.html", validation=validation)
     page = read_page(tmp_path / "report.html")
     rows = table_after(page, "Cross-validation")
@@ -266,7 +270,9 @@ def test_baselines_and_cross_validation_are_read_from_their_folders(study, tmp_p
     assert "Cross-validation" not in read_page(tmp_path / "report.html").text_content()
 
 
-def test_settings_are_those_stored_with_the_study(study, tmp_path):
+def test_settings_are_those_stored_with_the_study(tmp_path):
+    study = optuna.create_study(direction="maximize")
+    study.add_trial(make_trial(0, TrialState.COMPLETE, 1.0, 1))
     stored = {"environment": "Pendulum-v1", "checkpoints": [2000, 40000], "evaluation_episodes": 3, "seeds": [0, 1]}
     study.set_user_attr("settings", stored)
     write_report(study, tmp_path / "report.html")

@@ -283,13 +283,18 @@ def test_each_probability_is_over_the_tasks_of_its_two_variants(tmp_path: Path) 
     assert shown.count("Each probability is over the tasks that both variants have runs on") == 1
 
 
-def test_numbers_of_episodes_that_differ_are_named(tmp_path: Path) -> None:
-    plant(tmp_path, Cell("a", CHEETAH, 0), {100_000: 1.0}, evaluation_episodes=10)
-    plant(tmp_path, Cell("b", CHEETAH, 0), {100_000: 1.0}, evaluation_episodes=10)
+def test_what_differs_between_runs_is_counted(tmp_path: Path) -> None:
+    sessions = [{"commit": "c0ffee", "versions": "torch 2.12"}, {"commit": "c0ffee", "versions": "torch 2.13"}]
+    for seed in range(3):
+        plant(tmp_path, Cell("a", CHEETAH, seed), {100_000: 1.0}, sessions=sessions[:1], evaluation_episodes=10)
+    plant(tmp_path, Cell("b", CHEETAH, 0), {}, sessions=[], evaluation_episodes=10)
     assert table.mixed(table.read_runs(tmp_path)) == []
-    plant(tmp_path, Cell("c", CHEETAH, 0), {100_000: 1.0}, evaluation_episodes=3)
-    line = "Evaluations are means of different numbers of episodes: a 10, b 10, c 3"
-    assert table.mixed(table.read_runs(tmp_path)) == [line]
+    plant(tmp_path, Cell("c", CHEETAH, 0), {100_000: 1.0}, sessions=sessions, evaluation_episodes=3, program="mine.py")
+    assert table.mixed(table.read_runs(tmp_path)) == [
+        "Runs with different versions: torch 2.12 (3); torch 2.12, torch 2.13 (1)",
+        "Runs with different programs: aarl benchmark (4); mine.py (1)",
+        "Runs with different numbers of episodes: 10 (4); 3 (1)",
+    ]
 
 
 def test_every_task_weighs_the_same_in_an_interquartile_mean(tmp_path: Path) -> None:
@@ -415,17 +420,7 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
     assert tuple(early.loc["aarl_state", ["planned", "runs"]]) == (7, 4)
     shown = printed(tmp_path)
     assert "473 ± 5 (4/7)" in shown and "│ 4/7 │" in shown
-    assert "Runs of several commits or versions: c0ffee (9); beef (1)" in shown
-
-
-def test_commits_and_versions_that_differ_are_counted_by_run(tmp_path: Path) -> None:
-    old, new = ("torch 2.12, mujoco 3.17", "torch 2.13, mujoco 3.17")
-    plant(tmp_path, Cell("a", CHEETAH, 0), {100_000: 1.0}, sessions=[{"commit": "c0ffee", "versions": old}])
-    assert table.commits(table.read_runs(tmp_path)) == {"c0ffee": 1}
-    sessions = [{"commit": "c0ffee", "versions": old}, {"commit": "c0ffee", "versions": new}]
-    plant(tmp_path, Cell("a", CHEETAH, 1), {100_000: 1.0}, sessions=sessions)
-    plant(tmp_path, Cell("a", CHEETAH, 2), {}, sessions=[])
-    assert table.commits(table.read_runs(tmp_path)) == {"c0ffee": 2, "torch 2.12": 2, "torch 2.13": 1}
+    assert "Runs with different commits: c0ffee (8); c0ffee, beef (1)" in shown
 
 
 def test_two_copies_of_a_run_are_refused(tmp_path: Path) -> None:
@@ -447,7 +442,7 @@ def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) 
     assert f"│ cheetah-run │ 435 ± 7 ▼ │ 472 ± 30 │ 190 ± 1 │ 190 ± 32 │ {own[0]} │ {own[1]} │" in shown
     assert shown.index("AARL-State") < shown.index("CURL") and "Paper: table 4." in shown
     data = json.loads(json.dumps(table.as_data(number, comparison, iqm, better, runs)))
-    assert data["table"] == 4 and data["missing"] == [] and data["commits"] == {"c0ffee": len(runs)}
+    assert data["table"] == 4 and data["missing"] == []
     frames = {"scores": comparison, "improvements": better, "interquartile_means": iqm, "runs": runs}
     for name, frame in frames.items():
         same = pd.DataFrame(data[name], columns=list(frame.columns)).astype(frame.dtypes.to_dict())

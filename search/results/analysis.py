@@ -42,7 +42,7 @@ COUNTS = tuple(f"{name}, n_target > n_source" for name in ("State", "Action", "R
 # are integers.
 FORMATS = {
     **dict.fromkeys(("difference", "gain"), "+.2f"),
-    **dict.fromkeys(("welch_p", "student_p", "spearman_p", "kendall_p"), ".2g"),
+    **dict.fromkeys(("welch_p", "student_p"), ".2g"),
     **dict.fromkeys(("score", "mean", "std", "median", "mean_with", "mean_without", "spearman", "kendall"), ".2f"),
     **dict.fromkeys(("hours", "core_hours"), ".2f"),
     **{"importance": ".3f", "distinct": ".0%", "hamming": ".1f", "average": ".2f", "lowest": ".2f", "highest": ".2f"},
@@ -51,7 +51,7 @@ HEADINGS = {
     **{"n": "Losses", "std": "Deviation", "hamming": "Hamming distance", "index": "", "number": "Trial"},
     **{"device": "Trained on", "average": "Mean"},
     **{name: f"n {name[2:]}" for name in ("n_with", "n_without", "n_neither")},
-    **{"welch_p": "Welch p", "student_p": "Student p", "spearman_p": "Spearman p", "kendall_p": "Kendall p"},
+    **{"welch_p": "Welch p", "student_p": "Student p"},
 }
 COLUMNS: dict[str, Any] = {
     **{"number": int, "state": str, "generation": int, "slot": "Int64", "operation": str, "parents": object, "score": float},

@@ -76,7 +76,9 @@ def annotate_trial(study: Study, trial: Trial, artifact_store: FileSystemArtifac
     """
     trials = study.get_trials(deepcopy=False)
     frozen = trials[trial.number]
-    loss, curve = loss_of(frozen), _curve_so_far(frozen)
+    # Until all seeds are finished there is what was reported to Optuna, which has no deviations.
+    reported = [(step, mean, math.nan) for step, mean in sorted(frozen.intermediate_values.items())]
+    loss, curve = loss_of(frozen), curve_of(frozen) or reported
     note = [*_loss_lines(frozen, loss), _origin(frozen)]
     if "reason" in frozen.user_attrs:
         note.append(f"**Reason of the failure:** {_escape(frozen.user_attrs['reason'])}")
@@ -118,11 +120,6 @@ def serve(storage: BaseStorage, artifact_path: str | Path, host: str = "127.0.0.
     """
     Path(artifact_path).mkdir(parents=True, exist_ok=True)
     run_server(storage, host=host, port=port, artifact_store=FileSystemArtifactStore(artifact_path))
-
-
-def _curve_so_far(trial: FrozenTrial) -> Curve:
-    """The learning curve; until all seeds are finished, what was reported to Optuna, which has no deviations."""
-    return curve_of(trial) or [(step, mean, math.nan) for step, mean in sorted(trial.intermediate_values.items())]
 
 
 def _loss_lines(trial: FrozenTrial, loss: AuxLoss | None) -> list[str]:

@@ -267,8 +267,6 @@ def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
     :raises ValueError: when no trial has a learning curve, or they have different checkpoints
     """
     ranking = rankings(analysis.analysed(table))
-    if ranking.empty:
-        raise ValueError("no complete trial has a learning curve")
     agreement = rank_agreement(ranking, top)
     steps = [point[0] for point in ranking["curve"].iloc[0]]
     first, last = (EngFormatter(sep="")(step) for step in (steps[0], steps[-1]))
@@ -403,12 +401,10 @@ def _counts_each(tables: Mapping[str, pd.DataFrame]) -> str:
 
 
 def _seeds(curves: pd.DataFrame) -> str:
-    counts = curves.groupby("variant", sort=False)["seed"].nunique()
-    words = {variant: "1 seed (shade: episodes)" if n == 1 else f"{n} seeds" for variant, n in counts.items()}
-    if counts.nunique() == 1:
-        return next(iter(words.values()))
-    text = textwrap.fill(", ".join(f"{variant}: {word}" for variant, word in words.items()), 45)
-    return text if text.count("\n") < 3 else f"{counts.min()} to {counts.max()} seeds"
+    counts = curves.groupby("variant")["seed"].nunique()
+    low, high = counts.min(), counts.max()
+    text = f"{low} to {high} seeds" if low < high else f"{low} seed" if low == 1 else f"{low} seeds"
+    return text + (" (shade of one: its episodes)" if low == 1 else "")
 
 
 def _step_axis(axes: Axes) -> None:

@@ -5,7 +5,6 @@ from itertools import combinations
 
 import numpy as np
 import pandas as pd
-from scipy.stats import kendalltau, spearmanr
 
 METRICS = ("aulc", "first", "last")
 
@@ -18,9 +17,11 @@ def rankings(table: pd.DataFrame) -> pd.DataFrame:
     :return: One row a trial that has a curve, in the order of AULC: ``number``, ``loss``, ``curve``, ``aulc`` (mean return
         over all checkpoints), ``first`` and ``last`` (mean return at the first and the last checkpoint), ``rank_aulc``,
         ``rank_first``, ``rank_last`` (1 is the highest return, equals share the better rank)
-    :raises ValueError: when the curves have different checkpoints
+    :raises ValueError: when no trial has a learning curve, or they have different checkpoints
     """
     trials = table[table["curve"].map(len) > 0]
+    if trials.empty:
+        raise ValueError("no complete trial has a learning curve")
     checkpoints = [", ".join(str(point[0]) for point in curve) for curve in trials["curve"]]
     for number, steps in zip(trials["number"], checkpoints, strict=True):
         if steps != checkpoints[0]:
@@ -43,22 +44,17 @@ def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
 
     :param ranking: As returned by :func:`rankings`
     :param top: Size of the leading groups that are compared
-    :return: One row a pair of metrics: ``spearman``, ``spearman_p``, ``kendall``, ``kendall_p`` (scipy's, over all trials),
-        and ``shared``: how many trials are among the best ``top`` under both
+    :return: One row a pair of metrics: ``spearman`` and ``kendall`` (rank correlations over all trials), and ``shared``: how
+        many trials are among the best ``top`` under both
     """
     rows = {}
-    leaders = {metric: set(leading(ranking, metric, top)["number"]) for metric in METRICS}
-    for first, second in combinations(METRICS, 2):
+    for pair in combinations(METRICS, 2):
+        first, second = (ranking[metric] for metric in pair)
+        leaders = [set(leading(ranking, metric, top)["number"]) for metric in pair]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # too few trials, or all alike: NaN says so
-            spearman, kendall = (test(ranking[first], ranking[second]) for test in (spearmanr, kendalltau))
-        rows[first, second] = {
-            "spearman": spearman.statistic,
-            "spearman_p": spearman.pvalue,
-            "kendall": kendall.statistic,
-            "kendall_p": kendall.pvalue,
-            "shared": len(leaders[first] & leaders[second]),
-        }
+            warnings.simplefilter("ignore")  # too few trials, or all alike: NaN
+            correlations = {method: first.corr(second, method=method) for method in ("spearman", "kendall")}
+        rows[pair] = {**correlations, "shared": len(leaders[0] & leaders[1])}
     return pd.DataFrame.from_dict(rows, orient="index")
 
 

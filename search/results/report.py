@@ -167,17 +167,12 @@ def _taught(study: Study, table: pd.DataFrame) -> dict[str, Any] | None:
     texts = {name: analysis.readable(name, frame) for name, frame in summary.tables.items()}
     if "importances" in texts:
         texts["importances"] = texts["importances"].head(N_IMPORTANCES)
-    problem, rankings = "", None
-    try:
-        rankings = _picture(rankings_plot(table))
-    except ValueError as error:
-        problem = str(error)
     return {
         "n": n_analysed,
         "tables": texts,
-        "problems": summary.problems | {"rankings": problem},
+        "problems": summary.problems,
         "patterns": _picture(patterns_plot({study.study_name: table})),
-        "rankings": rankings,
+        "rankings": None if "rank_agreement" in summary.problems else _picture(rankings_plot(table)),
     }
 
 

@@ -32,13 +32,14 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
     :param n_resamples: Resamples of the bootstrap
     :return: One row for each ``checkpoint``, ``tasks`` (name of the scale; of a single task its own) and ``variant``:
         ``n_tasks``, ``planned``, ``runs`` that count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has
-        one run only), and the runs ``left_out``
+        one run only), the runs ``left_out``, and names of the tasks ``skipped``
     """
     rows = []
-    for (checkpoint, tasks), scale in runs.groupby(["checkpoint", scale_of(runs)], sort=False):
+    for (checkpoint, tasks), scale in runs.groupby(["checkpoint", _scale(runs)], sort=False):
         present = scale.dropna(subset="mean")
-        is_common = are_common(present)
+        is_common = present.groupby("environment")["variant"].nunique() == present["variant"].nunique()
         common = list(is_common.index[is_common])
+        skipped = ", ".join(map(task_name, is_common.index[~is_common]))
         tasks = task_name(common[0]) if len(common) == 1 else tasks
         for variant in present["variant"].unique() if common else ():
             planned = scale[scale["environment"].isin(common) & (scale["variant"] == variant)]
@@ -47,8 +48,9 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
             iqm = _iqm(*samples) if matrix.size else math.nan
             interval = _interval(samples, _iqm, n_resamples)
             left_out = planned["mean"].count() - matrix.size
-            rows.append((checkpoint, tasks, variant, len(common), len(planned), matrix.size, iqm, *interval, left_out))
-    columns = ["checkpoint", "tasks", "variant", "n_tasks", "planned", "runs", "iqm", "low", "high", "left_out"]
+            counts = (len(common), len(planned), matrix.size)
+            rows.append((checkpoint, tasks, variant, *counts, iqm, *interval, left_out, skipped))
+    columns = ["checkpoint", "tasks", "variant", "n_tasks", "planned", "runs", "iqm", "low", "high", "left_out", "skipped"]
     return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
 
 
@@ -73,22 +75,9 @@ def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFra
     return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high"])
 
 
-def scale_of(runs: pd.DataFrame) -> pd.Series:
-    """
-    The tasks whose returns can be averaged: those of DeepMind Control together, each other one by itself.
-
-    :param runs: Rows with an ``environment``
-    """
+def _scale(runs: pd.DataFrame) -> pd.Series:
+    """The tasks whose returns can be averaged: those of DeepMind Control together, each other one by itself."""
     return runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
-
-
-def are_common(runs: pd.DataFrame) -> pd.Series:
-    """
-    For each task, whether all variants that have any run have runs on it.
-
-    :param runs: Rows with a ``variant`` and an ``environment`` that have a run
-    """
-    return runs.groupby("environment")["variant"].nunique() == runs["variant"].nunique()
 
 
 def _iqm(*samples: np.ndarray, axis: int = -1) -> Any:

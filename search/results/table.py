@@ -4,7 +4,6 @@ import json
 import math
 from collections.abc import Iterable
 from functools import cache
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from rich.table import Table
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search.execution.matrix import comparable, task_name
-from search.results.statistics import SUITE, are_common, improvements, interquartile_means, scale_of
+from search.results.statistics import SUITE, improvements, interquartile_means
 from search.studies import operator_selection
 from search.studies.benchmark import read_abouts
 from search.training.run import FAILED
@@ -57,12 +56,8 @@ def paper_scores(number: int | None) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=PAPER_COLUMNS)
 
 
-def paper_variant(variant: str) -> str:
-    """
-    The paper's variant that one is: computed in bfloat16 it is the same one.
-
-    :param variant: Its name
-    """
+def _paper_variant(variant: str) -> str:
+    """The paper's variant that one is: computed in bfloat16 it is the same one."""
     return variant.removesuffix(BF16)
 
 
@@ -72,7 +67,7 @@ def closest_table(variants: Iterable[str]) -> int | None:
 
     :param variants: Names of variants
     """
-    names = set(map(paper_variant, variants))
+    names = set(map(_paper_variant, variants))
     matches = {number: len(names & set(table["columns"].values())) for number, table in _paper().items()}
     best = max(matches, key=lambda number: matches[number])
     return best if matches[best] else None
@@ -82,8 +77,8 @@ def read_runs(folder: Path) -> pd.DataFrame:
     """
     The runs of a benchmark: one row for each checkpoint of each planned run with ``variant``, ``environment``, ``seed``,
     ``checkpoint`` (environment steps), ``mean`` (return; NaN if it is missing), ``reason`` (why it is missing, else empty),
-    ``commit`` and ``versions`` (of all sessions that trained it), the ``program`` if it was not ``aarl benchmark``, and
-    ``episodes`` (of an evaluation; 0 if that is not known).
+    ``commit`` and ``versions`` (of all sessions that trained it), ``program`` and ``episodes`` (of an evaluation); empty or
+    0 where that is not known.
 
     :param folder: Folder of a benchmark; runs that were copied there from another machine count too
     :raises ValueError: when there are none, and as :func:`search.studies.benchmark.read_abouts` does
@@ -92,10 +87,10 @@ def read_runs(folder: Path) -> pd.DataFrame:
     for path, about in read_abouts(folder).items():
         curve = read_curve(path / "curve.csv") if (path / "curve.csv").exists() else []
         returns = {point.environment_steps: point.mean for point in curve}
-        commits = ", ".join(dict.fromkeys(session["commit"] for session in about["sessions"]))
-        packages = (session.get("versions", "").split(", ") for session in about["sessions"])
-        versions = ", ".join(filter(None, dict.fromkeys(chain.from_iterable(packages))))
-        settings = (commits, versions, about.get("program", ""), about.get("evaluation_episodes", 0))
+        commits, versions = (
+            ", ".join(dict.fromkeys(session.get(key, "") for session in about["sessions"])) for key in ("commit", "versions")
+        )
+        settings = (commits, versions, about.get("program", "aarl benchmark"), about.get("evaluation_episodes", 0))
         for checkpoint in about["checkpoints"]:
             mean = returns.get(checkpoint, math.nan)
             reason = "" if math.isfinite(mean) else _why_missing(path, about, checkpoint, returns)
@@ -139,10 +134,9 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     means, 2 sqrt(s^2 / n + S^2 / N), with s and n of the runs here, S and N of the paper's table; the paper does not say
     which deviation it prints. With one run here there is no s, and no mark.
 
-    For table 6 the returns are normalized as for table 2, see :func:`search.studies.operator_selection.table`: the paper
-    says for neither how. N is 5 seeds x 6 environments there. Both deviations then have the difference of the environments
-    in them, which makes the test a cautious one. Returns are normalized by the variants that are complete: if these are not
-    the paper's four, no number of the paper stands beside them.
+    For table 6 the returns are normalized as for table 2, see :func:`search.studies.operator_selection.table`, over the
+    variants that are complete: if these are not the paper's four, no number of the paper stands beside them. N is 5 seeds x
+    6 environments there, so both deviations contain the difference of the environments: the test is a cautious one.
 
     :param runs: As returned by :func:`read_runs`
     :param number: 3, 4 or 6, None for no table of the paper
@@ -157,7 +151,7 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     headings = dict(zip(paper["variant"], paper["column"], strict=True))
     paper = paper.rename(columns={"variant": "paper_variant", "mean": numbers[0], "std": numbers[1], "runs": numbers[2]})
     paper = paper.drop(columns="column").astype(dict.fromkeys(numbers, float))
-    result["paper_variant"] = result["variant"].map(paper_variant)
+    result["paper_variant"] = result["variant"].map(_paper_variant)
     names = zip(result["paper_variant"], result["variant"], strict=True)
     result["column"] = [headings.get(name, variant) for name, variant in names]
     result = result.merge(paper, on=[*keys[:2], "paper_variant"], how="left")
@@ -175,7 +169,7 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
 def _is_comparable(comparison: pd.DataFrame) -> bool:
     """Whether the scores of a checkpoint can be compared with the paper's: not if they are normalized by other variants."""
     is_normalized = (comparison["environment"] == NORMALIZED).any()
-    variants = sorted(map(paper_variant, comparison.dropna(subset="mean")["variant"]))
+    variants = sorted(map(_paper_variant, comparison.dropna(subset="mean")["variant"]))
     return not is_normalized or variants == sorted(_paper()[6]["columns"].values())
 
 
@@ -213,35 +207,21 @@ def missing(runs: pd.DataFrame) -> list[str]:
     return lines
 
 
-def commits(runs: pd.DataFrame) -> dict[str, int]:
-    """
-    How many runs were trained with each commit, and with each version of packages of which there are several. A run that was
-    resumed with another one counts for both.
-
-    :param runs: As returned by :func:`read_runs`
-    """
-    distinct = runs.drop_duplicates(["variant", "environment", "seed"])
-    counts, versions = (distinct[key].str.split(", ").explode().value_counts() for key in ("commit", "versions"))
-    several = versions[versions.index.str.split(" ").str[0].duplicated(keep=False)]
-    return {str(name): int(count) for name, count in pd.concat([counts, several]).items() if name}
-
-
 def mixed(runs: pd.DataFrame) -> list[str]:
     """
-    A line if runs were trained with several commits or versions, as counted by :func:`commits`, one for each program that is
-    not ``aarl benchmark``, and one if evaluations have different numbers of episodes.
+    A line for each of these that differs between the runs, with the number of runs: commits, versions of packages, programs
+    that trained them, and episodes of an evaluation.
 
     :param runs: As returned by :func:`read_runs`
     """
-    counts = commits(runs)
-    text = "; ".join(f"{commit} ({count})" for commit, count in counts.items())
-    lines = [f"Runs of several commits or versions: {text}"] if len(counts) > 1 else []
-    for program, group in runs[runs["program"] != ""].groupby("program"):
-        lines.append(f"Trained by {program}: {', '.join(dict.fromkeys(group['variant']))}")
-    episodes = runs[runs["episodes"] > 0].drop_duplicates(["variant", "episodes"])
-    if episodes["episodes"].nunique() > 1:
-        text = ", ".join(f"{row['variant']} {row['episodes']}" for row in episodes.to_dict("records"))
-        lines.append(f"Evaluations are means of different numbers of episodes: {text}")
+    names = {"commit": "commits", "versions": "versions", "program": "programs", "episodes": "numbers of episodes"}
+    runs = runs.drop_duplicates(["variant", "environment", "seed"])
+    lines = []
+    for key, name in names.items():
+        counts = runs.loc[~runs[key].isin(["", 0]), key].value_counts()
+        if len(counts) > 1:
+            text = "; ".join(f"{value} ({count})" for value, count in counts.items())
+            lines.append(f"Runs with different {name}: {text}")
     return lines
 
 
@@ -353,12 +333,8 @@ def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, b
         )
     if iqm["left_out"].any():
         lines.append("Interquartile means leave out the seeds that a variant has on some of the tasks only.")
-    present = comparison[(comparison["environment"] != NORMALIZED) & (comparison["runs"] > 0)]
-    for (checkpoint, _), part in present.groupby(["checkpoint", scale_of(present)]):
-        if some := [task_name(str(name)) for name, is_common in are_common(part).items() if not is_common]:
-            lines.append(
-                f"At {_steps(checkpoint)} not every variant has runs on {', '.join(some)}: interquartile means leave that out."
-            )
+    for (checkpoint, tasks), _ in iqm[iqm["skipped"] != ""].groupby(["checkpoint", "skipped"]):
+        lines.append(f"At {_steps(checkpoint)} not every variant has runs on {tasks}: interquartile means leave that out.")
     if better.groupby("checkpoint")["n_tasks"].nunique().gt(1).any():
         lines.append("Each probability is over the tasks that both variants have runs on, which are not the same for all.")
     if (better["probability"].isin([0, 1]) & (better["low"] == better["high"])).any():
@@ -387,7 +363,7 @@ def as_data(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, bet
     """
     frames = {"scores": comparison, "interquartile_means": iqm, "improvements": better, "runs": runs}
     records = {name: json.loads(frame.to_json(orient="records", double_precision=15)) for name, frame in frames.items()}
-    return {"table": number, **records, "missing": missing(runs), "commits": commits(runs)}
+    return {"table": number, **records, "missing": missing(runs)}
 
 
 def _steps(checkpoint: Any) -> str:
