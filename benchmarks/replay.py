@@ -1,8 +1,8 @@
 """
-How fast the replay buffer gives images, and what a transition takes, beside SB3's own buffer in the same process.
+Time to draw images from the replay buffer and memory of a transition, beside SB3's own buffer in the same process.
 
 Windows of horizon 3 (4 observations) of three stacked frames of 100 x 100 x 3, randomly cropped to 84 x 84, batch 128: 512
-observations. SB3's buffer gives as many as 256 transitions, whole. Both draw from rings of the same length, in turns.
+observations. SB3's buffer returns as many as 256 transitions, whole. Both draw from rings of the same length, in turns.
 """
 
 import argparse
@@ -29,53 +29,47 @@ ACTIONS = spaces.Box(-1, 1, (6,), np.float32)
 BATCH, HORIZON, CROP = 128, 3, 84
 
 
-def resident() -> int:
+def fill(buffer: ReplayBuffer, transitions: int) -> float:
+    """
+    Random frames in episodes of 250 agent steps.
+
+    :return: Bytes of resident memory for each transition
+    """
     gc.collect()
-    return psutil.Process().memory_info().rss
-
-
-def fill(buffer: ReplayBuffer, transitions: int) -> None:
-    """Random frames in episodes of 250 agent steps."""
+    before = psutil.Process().memory_info().rss
     rng = np.random.default_rng(0)
-    pool = rng.integers(0, 256, (64, 3, 100, 100), np.uint8)
+    frames = rng.integers(0, 256, (64, 3, 100, 100), np.uint8)
     for step in range(transitions):
         if step % 250 == 0:
-            obs = np.concatenate([pool[step % 64]] * 3)
-        next_obs = np.concatenate([obs[3:], pool[rng.integers(64)]])
-        over = step % 250 == 249
-        rest = (rng.uniform(-1, 1, (1, 6)), rng.normal(size=1), np.array([over]), [{"TimeLimit.truncated": over}])
+            obs = np.concatenate([frames[step % 64]] * 3)
+        next_obs = np.concatenate([obs[3:], frames[rng.integers(64)]])
+        done = step % 250 == 249
+        rest = (rng.uniform(-1, 1, (1, 6)), rng.normal(size=1), np.array([done]), [{"TimeLimit.truncated": done}])
         buffer.add(obs[None], next_obs[None], *rest)
         obs = next_obs
+    return (psutil.Process().memory_info().rss - before) / transitions
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--transitions", type=int, default=10_000, help="length of both rings (SB3's takes 180 kB each)")
     parser.add_argument("--rounds", type=int, default=25)
-    parser.add_argument(
-        "--device", default="cpu", help="device of what is drawn, and of the frames in the last row if not cpu"
-    )
+    parser.add_argument("--device", default="cpu", help="device of the samples, and of the frames in the last row if not cpu")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
-    bytes_each: dict[str, float] = {}
-
-    def make(name: str, cls: type[ReplayBuffer], **kwargs: Any) -> Any:
-        before = resident()
-        buffer = cls(args.transitions, IMAGES, ACTIONS, args.device, **kwargs)
-        fill(buffer, args.transitions)
-        bytes_each[name] = (resident() - before) / args.transitions
-        return buffer
-
-    draws: dict[str, Callable[[], Any]] = {}
-    theirs = make("SB3", ReplayBuffer)
-    draws["SB3"] = lambda: theirs.sample(BATCH * (HORIZON + 1) // 2)
-    ours = make("windows, cropped", WindowReplayBuffer, frame_stack=3)
-    draws["windows, cropped"] = lambda: ours.sample_windows(BATCH, HORIZON, crop_size=CROP)
-    draws["windows, whole"] = lambda: ours.sample_windows(BATCH, HORIZON)
-    draws["transitions, cropped"] = lambda: ours.sample(BATCH * (HORIZON + 1) // 2, crop_size=CROP)
+    theirs = ReplayBuffer(args.transitions, IMAGES, ACTIONS, args.device)
+    ours = WindowReplayBuffer(args.transitions, IMAGES, ACTIONS, args.device, frame_stack=3)
+    memory = {"SB3": fill(theirs, args.transitions), "windows, cropped": fill(ours, args.transitions)}
+    draws: dict[str, Callable[[], Any]] = {
+        "SB3": lambda: theirs.sample(BATCH * (HORIZON + 1) // 2),
+        "windows, cropped": lambda: ours.sample_windows(BATCH, HORIZON, crop_size=CROP),
+        "windows, whole": lambda: ours.sample_windows(BATCH, HORIZON),
+        "transitions, cropped": lambda: ours.sample(BATCH * (HORIZON + 1) // 2, crop_size=CROP),
+    }
     if args.device != "cpu":
-        there = make("windows, cropped, on the device", WindowReplayBuffer, frame_stack=3, storage_device=args.device)
+        there = WindowReplayBuffer(args.transitions, IMAGES, ACTIONS, args.device, frame_stack=3, storage_device=args.device)
+        fill(there, args.transitions)
         draws["windows, cropped, on the device"] = lambda: there.sample_windows(BATCH, HORIZON, crop_size=CROP)
 
     seconds: dict[str, list[float]] = {name: [] for name in draws}
@@ -88,24 +82,21 @@ def main() -> None:
             if i:  # the first one warms up
                 seconds[name].append(time.perf_counter() - started)
 
-    names = ("what is drawn", "ms", "windows a second", "observations a second", "times SB3's rate", "bytes a transition")
-    table = Table(*names)
+    table = Table("draw", "ms", "observations a second", "times SB3's rate", "bytes a transition")
     rows = []
     for name, values in seconds.items():
+        median = statistics.median(values)
         row: dict[str, Any] = {
             "draw": name,
-            "ms": 1e3 * statistics.median(values),
-            "windows_per_second": BATCH / statistics.median(values) if name.startswith("windows") else None,
-            "observations_per_second": BATCH * (HORIZON + 1) / statistics.median(values),
+            "ms": 1e3 * median,
+            "windows_per_second": BATCH / median if name.startswith("windows") else None,
+            "observations_per_second": BATCH * (HORIZON + 1) / median,
             "times_sb3": statistics.median(base / own for own, base in zip(values, seconds["SB3"], strict=True)),
-            "bytes_per_transition": bytes_each.get(name),
+            "bytes_per_transition": memory.get(name),
         }
         rows.append(row)
-        windows, size = (
-            "" if row[key] is None else f"{row[key]:,.0f}" for key in ("windows_per_second", "bytes_per_transition")
-        )
-        rate = f"{row['observations_per_second']:,.0f}"
-        table.add_row(name, f"{row['ms']:.2f}", windows, rate, f"{row['times_sb3']:.2f}", size)
+        size = f"{memory[name]:,.0f}" if name in memory else ""
+        table.add_row(name, f"{row['ms']:.2f}", f"{row['observations_per_second']:,.0f}", f"{row['times_sb3']:.2f}", size)
     Console().print(table)
     if args.out:
         save_result(args.out, transitions=args.transitions, rows=rows)
