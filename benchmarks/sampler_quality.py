@@ -292,7 +292,7 @@ def main() -> None:
     wanted = [(o, s, seed) for seed in range(args.seeds) for s in args.samplers for o in args.objectives]
     todo = [(*key, args.evaluations) for key in wanted if key not in known]
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-    # Started anew, not forked: the children of a process with threads would hang now and then.
+    # Spawned, not forked: the children of a process with threads hang now and then.
     with multiprocessing.get_context("spawn").Pool(args.processes) as pool:
         for cell in pool.imap_unordered(run, todo):
             done.append(cell)

@@ -1,9 +1,9 @@
 """
 What asking for a candidate costs: study.ask() and all suggestions, in memory, after 100 to 10,000 finished trials.
 
-The study is filled by the sampler itself. 200 asks follow at each size, each told at once, so that with AuxLossSampler two
-whole stages pass: the first asks of a stage, with the choice of parents and the fit of the model, are among them. Python's
-collection of garbage, which looks at all objects of the process and falls on whoever asks then, is told apart.
+The study is filled by the sampler itself. 200 asks follow at each size, each trial finished at once, so that with
+AuxLossSampler two whole generations pass: the first asks of a generation, with the choice of parents and the fit of the model,
+are among them. Python's collection of garbage, which looks at all objects of the process, is measured separately.
 """
 
 import argparse
@@ -30,7 +30,7 @@ SAMPLERS: dict[str, Callable[[], BaseSampler]] = {
 def measure(sampler: BaseSampler, sizes: list[int], n_asks: int) -> list[dict[str, float]]:
     """
     Median and maximum at each size, in milliseconds, of the time without collections of garbage; also of processor time, which
-    other processes spare, and the longest collection.
+    other processes do not change, and the longest collection.
     """
     gc.collect()  # the study before has many objects: not in the middle of this one
     collecting: list[float] = []  # when each began, and then how long it took

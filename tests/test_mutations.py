@@ -155,7 +155,7 @@ def test_mutations_keep_the_operator_unless_it_is_searched(loss: AuxLoss, seed: 
 def test_a_searched_operator_changes_as_often_as_a_bit() -> None:
     parent, rng = AuxLoss(6, (True,) * 19, (True,) * 19), np.random.default_rng(4)
     children = [replacement(parent, rng, OPERATORS) for _ in range(20_000)]
-    # Drawn anew with probability 1/38: one time in five it is the same again.
+    # Redrawn with probability 1/38: one time in five it is the same again.
     assert binomtest(sum(child.operator != "mse" for child in children), 20_000, 1 / 38 * 4 / 5).pvalue > 0.001
     assert binomtest(sum(child.negatives for child in children), 20_000, 1 / 38).pvalue > 0.001
     others = Counter(child.operator for child in children if child.operator != "mse")

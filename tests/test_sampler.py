@@ -53,7 +53,7 @@ def score(loss: AuxLoss) -> float:
 
 def lot(loss: AuxLoss, n: int) -> int:
     """The same number below ``n`` for a loss in every process."""
-    return sum(bit << place for place, bit in enumerate(loss.source + loss.target)) * 7919 % 10007 % n
+    return sum(bit << index for index, bit in enumerate(loss.source + loss.target)) * 7919 % 10007 % n
 
 
 def run(study: optuna.Study, objective: Callable[[AuxLoss], float] = score) -> optuna.Study:

@@ -262,11 +262,11 @@ def test_a_space_other_than_the_sampler_s_is_refused(settings: dict[str, Any], a
 def test_the_loss_of_a_trial() -> None:
     loss = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
     params: dict[str, Any] = loss_to_params(loss)
-    for given, expected in (
+    for trial_params, expected in (
         (params, loss),
         ({}, None),
         ({"horizon": 1}, None),
         (params | {"source/s_t": False}, None),
     ):
-        space = {name: distributions(1)[name] for name in given}
-        assert loss_of(optuna.create_trial(params=given, distributions=space, value=0.0)) == expected
+        space = {name: distributions(1)[name] for name in trial_params}
+        assert loss_of(optuna.create_trial(params=trial_params, distributions=space, value=0.0)) == expected

@@ -9,7 +9,7 @@ from search.evolution.space import MAX_HORIZON, Bits, is_valid, random_operator
 
 
 class RejectedLoss(ValueError):
-    """What a mutation gave is no valid loss (paper, A.3: it is drawn again)."""
+    """A mutation returned what is no valid loss (paper, A.3: it is redrawn)."""
 
 
 def _build(horizon: int, source: Bits, target: Bits, operator: str, negatives: bool) -> AuxLoss:
@@ -25,7 +25,7 @@ def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str
     :param loss: The parent
     :param rng: Source of randomness
     :param operators: Operators that are searched too (the paper does not say how): with the same probability each, the
-        operator is drawn anew and negatives are switched; None to keep both
+        operator is redrawn and negatives are switched; None to keep both
     :raises RejectedLoss: when the offspring is not valid
     """
     flip_rate = 1 / (2 * (3 * loss.horizon + 1))

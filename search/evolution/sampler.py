@@ -158,7 +158,8 @@ class AuxLossSampler(BaseSampler):
     def is_complete(self, study: Study) -> bool:
         """Whether the last of ``n_generations`` is over."""
         with LOCK:
-            return self._refresh(study).candidates.generation > (self.n_generations or math.inf)
+            slots = self._refresh(study)
+            return slots.candidates.generation > slots.last
 
     def stop_when_complete(self, study: Study, trial: FrozenTrial) -> None:
         """A callback for ``study.optimize`` that ends it after the last generation."""
@@ -316,7 +317,8 @@ class _Slots:
         if not free:
             generation = int(min(self.candidates.generation, self.last))
             free = [(generation, len(self.sampler.operations(generation)) + number)]
-            logger.warning("Trial %d is one more of generation %d: %s hold its slots", number, generation, self.unfinished)
+            others = [other for other in self.unfinished if other != number]
+            logger.warning("Trial %d is one more of generation %d: trials %s hold its slots", number, generation, others)
         (generation, slot), attempt = free[0], self.failed[free[0]]
         key = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
         if given is not None:
