@@ -160,24 +160,13 @@ def test_encoder_and_target_encoder_that_are_one() -> None:
     assert value.item() == 0 and encoder.calls == [True, False]
 
 
-@pytest.mark.parametrize(
-    "text, source_dim, target_dim",
-    [
-        ("{s_t} -> {s_t}", 50, 50),
-        ("{s_t, a_t} -> {r_t}", 56, 1),
-        ("{s_t, s_t+2, a_t+1, r_t, r_t+1} -> {s_t+1, a_t, a_t+1, r_t+1}", 108, 63),
-    ],
-)
-def test_widths_of_the_predictor(text: str, source_dim: int, target_dim: int) -> None:
-    loss = AuxLoss.parse(text, "bilinear")
-
-    def widths(head: AuxHead) -> list[tuple[int, int]]:
-        return [(layer.in_features, layer.out_features) for layer in head.predictor if isinstance(layer, nn.Linear)]
-
+def test_widths_of_the_predictor() -> None:
+    loss = AuxLoss.parse("{s_t, s_t+2, a_t+1, r_t, r_t+1} -> {s_t+1, a_t, a_t+1, r_t+1}", "bilinear")
     paper = AuxHead(loss, latent_dim=50, action_dim=6)
-    assert widths(paper) == [(source_dim, 256), (256, target_dim)]
-    assert [type(layer) for layer in paper.predictor] == [nn.Linear, nn.ReLU, nn.Linear]
     public_code = AuxHead(loss, 50, 6, predictor_width=None, predictor_batch_norm=True)
-    assert widths(public_code) == [(source_dim, 2 * source_dim), (2 * source_dim, target_dim)]
+    for head, width in ((paper, 256), (public_code, 2 * 108)):
+        linear = [layer for layer in head.predictor if isinstance(layer, nn.Linear)]
+        assert [(layer.in_features, layer.out_features) for layer in linear] == [(108, width), (width, 63)]
+    assert [type(layer) for layer in paper.predictor] == [nn.Linear, nn.ReLU, nn.Linear]
     assert [type(layer) for layer in public_code.predictor] == [nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Linear]
-    assert paper.operator.weight.shape == (target_dim, target_dim)
+    assert paper.operator.weight.shape == (63, 63)

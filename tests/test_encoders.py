@@ -39,8 +39,8 @@ def naive_projection(x: np.ndarray, parameters: list[np.ndarray], tanh: bool = F
     return np.tanh(x) if tanh else x
 
 
-@pytest.mark.parametrize("size", [(84, 84), (100, 100), (15, 15), (16, 15), (64, 48), (21, 90)])
-@pytest.mark.parametrize("channels", [1, 3, 9])
+@pytest.mark.parametrize("size", [(84, 84), (15, 15), (16, 15), (21, 90)])
+@pytest.mark.parametrize("channels", [1, 9])
 def test_pixel_encoder_takes_any_size(size: tuple[int, int], channels: int) -> None:
     space = images(channels, *size)
     encoder = PixelEncoder(space, features_dim=6)
@@ -54,7 +54,7 @@ def test_pixel_encoder_takes_any_size(size: tuple[int, int], channels: int) -> N
     assert encoder.trunk_dim == 32 * height * width
 
 
-def test_pixel_encoder_at_the_papers_size() -> None:
+def test_the_papers_sizes() -> None:
     encoder = PixelEncoder(images(9, 84, 84))
     assert encoder.trunk_dim == 32 * 35 * 35 and encoder.features_dim == 50
     convolutions = [layer for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)]
@@ -62,6 +62,9 @@ def test_pixel_encoder_at_the_papers_size() -> None:
         (9, 32, (3, 3), (2, 2)),
         *[(32, 32, (3, 3), (1, 1))] * 3,
     ]
+    dense = DenseMLP(vectors(17))
+    assert [tuple(layer.weight.shape) for layer in dense.layers] == [(40, 17)]
+    assert (dense.trunk_dim, dense.features_dim) == (57, 40)
 
 
 @pytest.mark.parametrize("tanh", [False, True])
@@ -126,14 +129,6 @@ def test_initialisation(encoder: nn.Module) -> None:
     assert nn.Linear in seen
 
 
-def test_a_fresh_convolution_keeps_lengths() -> None:
-    """What delta-orthogonal is for: each pixel's channels are rotated, so inner lengths grow by the gain alone."""
-    layer = PixelEncoder(images(3, 16, 16), n_filters=8).convolutions[0]
-    x = th.randn(2, 3, 16, 16)
-    middle = x[:, :, 1:-1:2, 1:-1:2]
-    np.testing.assert_allclose(layer(x).detach().norm(dim=1), np.sqrt(2) * middle.norm(dim=1), rtol=1e-4)
-
-
 @pytest.mark.parametrize("cls", [DenseMLP, MLP])
 @pytest.mark.parametrize("shape, n_layers, width", [((5,), 1, 4), ((3,), 4, 3), ((2, 3), 2, 5)])
 def test_mlps_against_a_naive_forward_pass(cls: type[DenseMLP], shape: tuple[int, ...], n_layers: int, width: int) -> None:
@@ -150,20 +145,6 @@ def test_mlps_against_a_naive_forward_pass(cls: type[DenseMLP], shape: tuple[int
     np.testing.assert_allclose(encoder.trunk(observations).detach(), x, rtol=1e-4, atol=1e-5)
     expected = naive_projection(x, arrays(encoder.projection))
     np.testing.assert_allclose(encoder(observations).detach(), expected, rtol=1e-3, atol=1e-4)
-
-
-def test_dense_mlp_has_the_papers_widths() -> None:
-    encoder = DenseMLP(vectors(17))
-    assert [tuple(layer.weight.shape) for layer in encoder.layers] == [(40, 17)]
-    assert (encoder.trunk_dim, encoder.features_dim) == (57, 40)
-    assert DenseMLP(vectors(17), n_layers=4).trunk_dim == 17 + 4 * 40
-
-
-def test_a_new_projection_is_like_the_own_but_shares_nothing() -> None:
-    encoder = DenseMLP(vectors(3), 4, width=2)
-    other = encoder.make_projection()
-    assert [p.shape for p in other.parameters()] == [p.shape for p in encoder.projection.parameters()]
-    assert not set(map(id, other.parameters())) & set(map(id, encoder.parameters()))
 
 
 @pytest.mark.parametrize(

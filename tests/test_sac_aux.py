@@ -127,17 +127,22 @@ def assert_same(first: Any, second: Any, where: str = "") -> None:
 # --- SB3's SAC ---------------------------------------------------------------------------------------------------------
 
 
-def pendulum(n_envs: int) -> DummyVecEnv:
-    return DummyVecEnv([lambda: gym.make("Pendulum-v1", max_episode_steps=20)] * n_envs)
+def sac_and_ours(policy: str, env: Callable[[], Any], steps: int, ours: dict[str, Any], **settings: Any) -> tuple[SAC, SACAux]:
+    """SB3's SAC and SACAux without an auxiliary loss, trained alike."""
+    both: dict[str, Any] = {"buffer_size": 500, "learning_starts": 10, "batch_size": 16, "learning_rate": 1e-3, "tau": 0.02}
+    both |= {"seed": 5, "device": "cpu", **settings}
+    sac = SAC(policy, env(), **both).learn(steps)
+    ours = {**both, **ours, "policy_kwargs": {**both["policy_kwargs"], **ours["policy_kwargs"]}}
+    as_in_sb3: dict[str, Any] = {"policy_delay": 1, "target_update_interval": 1, "ent_coef_learning_rate": None}
+    as_in_sb3 |= {"ent_coef_betas": (0.9, 0.999), "ent_coef": "auto", "aux_loss": None}
+    return sac, SACAux(policy, env(), **{**as_in_sb3, **ours}).learn(steps)
 
 
 @pytest.mark.parametrize(
     ("n_envs", "settings"),
     [
         (1, {}),
-        (2, {}),
         (1, {"ent_coef": 0.2}),
-        (1, {"n_steps": 3}),
         (2, {"n_steps": 3, "gradient_steps": -1}),
         (1, {"use_sde": True, "sde_sample_freq": 4}),
         (1, {"learning_rate": lambda remaining: 1e-2 * remaining}),
@@ -147,32 +152,12 @@ def pendulum(n_envs: int) -> DummyVecEnv:
     ids=name,
 )
 def test_without_aux_loss_is_sac(n_envs: int, settings: dict[str, Any]) -> None:
-    both: dict[str, Any] = {
-        "learning_rate": 1e-3,
-        "buffer_size": 1000,
-        "learning_starts": 24,
-        "batch_size": 16,
-        "tau": 0.02,
-        "target_update_interval": 1,
-        "ent_coef": "auto",
-        "seed": 5,
-        "device": "cpu",
-        **settings,
-    }
-    steps = 60 * n_envs + 24
-    policy_kwargs = {"net_arch": [16], **both.pop("policy_kwargs", {})}
-    sac = SAC("MlpPolicy", pendulum(n_envs), policy_kwargs=policy_kwargs, **both).learn(steps)
-    ours = SACAux(
-        "MlpPolicy",
-        pendulum(n_envs),
-        policy_kwargs={"features_extractor_class": "identity", **policy_kwargs},
-        aux_loss=None,
-        policy_delay=1,
-        ent_coef_learning_rate=None,
-        ent_coef_betas=(0.9, 0.999),
-        **both,
-    ).learn(steps)
+    def pendulum() -> DummyVecEnv:
+        return DummyVecEnv([lambda: gym.make("Pendulum-v1", max_episode_steps=20)] * n_envs)
 
+    identity = {"policy_kwargs": {"features_extractor_class": "identity"}}
+    settings = {"policy_kwargs": {"net_arch": [16]}, **settings}
+    sac, ours = sac_and_ours("MlpPolicy", pendulum, 60 * n_envs + 10, identity, **settings)
     assert ours._n_updates == sac._n_updates >= 45
     assert_same(everything(ours), everything(sac))
 
@@ -180,39 +165,12 @@ def test_without_aux_loss_is_sac(n_envs: int, settings: dict[str, Any]) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_with_encoders_of_their_own_is_sac(kind: str) -> None:
     """SB3's default: actor and critic each train an encoder, here of a class of the user's own."""
-    both: dict[str, Any] = {
-        "learning_starts": 10,
-        "batch_size": 8,
-        "buffer_size": 200,
-        "learning_rate": 1e-3,
-        "tau": 0.01,
-        "target_update_interval": 1,
-        "seed": 5,
-        "device": "cpu",
-    }
     extractor = {"state": FlattenExtractor, "pixels": SmallCNN, "dict": SmallCombined}[kind]
     # SB3's optimizer; the fused one of SACAux rounds in another way.
-    policy_kwargs: dict[str, Any] = {
-        "net_arch": [16],
-        "features_extractor_class": extractor,
-        "optimizer_kwargs": {"fused": False},
-    }
-    sac = SAC(POLICIES[kind], make_env(kind), policy_kwargs=policy_kwargs, **both).learn(70)
-    ours = SACAux(
-        POLICIES[kind],
-        make_env(kind),
-        policy_kwargs={**policy_kwargs, "share_features_extractor": False},
-        aux_loss=None,
-        policy_delay=1,
-        encoder_tau=0.01,
-        ent_coef="auto",
-        ent_coef_learning_rate=None,
-        ent_coef_betas=(0.9, 0.999),
-        augmentation="none",
-        **both,
-    ).learn(70)
-
-    assert ours._n_updates == 60
+    policy_kwargs = {"net_arch": [16], "features_extractor_class": extractor, "optimizer_kwargs": {"fused": False}}
+    settings = {"encoder_tau": 0.02, "augmentation": "none", "policy_kwargs": {"share_features_extractor": False}}
+    sac, ours = sac_and_ours(POLICIES[kind], lambda: make_env(kind), 60, settings, policy_kwargs=policy_kwargs)
+    assert ours._n_updates == sac._n_updates == 50
     assert_same(everything(ours), everything(sac))
 
 
@@ -394,8 +352,7 @@ class Naive:
     [
         ("mse", False, False, None),
         ("mse", True, False, (-10, 2)),
-        ("mse", False, True, None),
-        ("bilinear", True, False, None),
+        ("bilinear", True, True, None),
         ("bilinear", False, False, (-5, 1)),
     ],
 )
@@ -517,18 +474,6 @@ def test_targets_are_moving_averages(kind: str) -> None:
             if number % 2 == 0:
                 expected[name] = (1 - tau) * expected[name] + tau * value
             th.testing.assert_close(model.critic_target.state_dict()[name], expected[name], rtol=0, atol=1e-6)
-
-
-def test_running_statistics_of_the_encoder_are_copied() -> None:
-    kwargs = {"features_extractor_class": SmallCNN, "features_extractor_kwargs": {}}
-    model = filled_model("pixels", target_update_interval=1, policy_kwargs=kwargs)
-    before = model.critic.features_extractor.norm.running_mean.clone()
-    model.train(2, batch_size=16)
-    norms = [critic.features_extractor.norm for critic in (model.critic, model.critic_target)]
-    assert not th.equal(before, norms[0].running_mean)
-    for name in ("running_mean", "running_var"):
-        assert th.equal(getattr(norms[0], name), getattr(norms[1], name))
-    assert norms[0].training and not norms[1].training
 
 
 def test_schedules_and_aux_coef() -> None:
