@@ -390,8 +390,8 @@ def test_a_benchmark_grows_and_names_what_failed(folder: Path, executor: Executo
 
 @pytest.mark.slow
 def test_a_search_for_real(folder: Path) -> None:
-    """SIGTERM, as clusters send it, the same command again, and all that reads its results."""
-    config = write_search(folder, MATRICES.replace("seeds: [0, 1]\n", ""))
+    """SIGTERM, as clusters send it, the same command again, and a report."""
+    config = write_search(folder)
     process = start("search", config, "--generations", 1, folder=folder)
     while not list(Path("runs").rglob("checkpoint*")) and process.poll() is None:
         time.sleep(0.1)
@@ -402,11 +402,7 @@ def test_a_search_for_real(folder: Path) -> None:
     assert trial.state == TrialState.FAIL and trial.user_attrs["interrupted"]
     output = aarl("search", config, "--generations", 1, "--workers", 2, folder=folder)
     assert "generation 1: 4/4 done" in output.splitlines()[-2]
-    assert "SAC" in aarl("baselines", config, "--workers", 2, folder=folder)
-    run("report", "runs/small")
-    page = Path("runs/small/report.html").read_text()
-    assert "CURL" in page and "4 candidates" in page
-    run("analyze")
-    run("figures", "evolution")
-    best = optuna.load_study(study_name="small", storage=open_storage(Path("runs/small"))).best_trial
-    assert best.user_attrs["canonical"]
+    run("report", config)
+    study = optuna.load_study(study_name="small", storage=open_storage(Path("runs/small")))
+    notation = str(AuxLoss.parse(study.best_trial.user_attrs["loss"]))
+    assert notation.replace(">", "&gt;") in Path("runs/small/report.html").read_text()

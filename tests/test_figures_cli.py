@@ -1,10 +1,9 @@
-"""aarl analyze, aarl figures and what the report says of a benchmark: from planted studies and runs, as a user calls them."""
+"""aarl analyze, aarl figures and the benchmark in a report: from planted studies and runs, as a user calls them."""
 
 import csv
 import json
 import re
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 
 import lxml.html
@@ -13,13 +12,17 @@ import optuna
 import pytest
 import scipy.stats
 from optuna.trial import TrialState, create_trial
+from tiny import tiny_run
 from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import Evaluation, write_curve
 from search.cli.main import app
 from search.evolution.space import distributions, loss_to_params, random_loss
-from search.execution.storage import open_storage
+from search.execution.matrix import Cell, cell_folder
+from search.execution.storage import load_study, open_storage
 from search.studies.benchmark import read_curves
+from search.training.provenance import write_about
+from search.training.run import prepare_run
 
 runner = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"})
 FIGURES = ("evolution", "histogram", "rankings", "patterns")
@@ -31,36 +34,54 @@ def run(*arguments: object, fails: bool = False) -> str:
     return result.stderr if fails else result.stdout
 
 
-def plant(where: str, name: str, seed: int) -> optuna.Study:
-    """60 candidates, better with s_t in the source, and a failed one; and two baselines."""
+def plant(folder: Path, name: str, seed: int, n_candidates: int, url: str | None = None) -> None:
+    """Candidates, better with s_t in the source, and a failed one; and two baselines."""
     rng = np.random.default_rng(seed)
-    storage = open_storage(where)
-    study = optuna.create_study(study_name=name, storage=storage, direction="maximize")
-    for i in range(60):
+    study = optuna.create_study(study_name=name, storage=open_storage(folder, url), direction="maximize")
+    trials = []
+    for i in range(n_candidates):
         loss = random_loss(rng, 2)
         score = float(rng.normal(100, 5) + 50 * loss.source[0])
         curve = [[1000, score - 10.0, 1.0], [2000, score + 10.0, 1.0]]
-        attrs = {"stage": 1 + i // 30, "operation": "random", "curve": curve, "device": "CPU: some", "threads": 2}
+        attrs = {
+            "generation": 1 + 2 * i // n_candidates,
+            "operation": "random",
+            "curve": curve,
+            "device": "CPU: some",
+            "threads": 2,
+        }
         params, space = loss_to_params(loss), distributions(loss.horizon)
-        study.add_trial(create_trial(value=score, params=params, distributions=space, user_attrs=attrs))
-    study.add_trial(create_trial(state=TrialState.FAIL))
-    baselines = optuna.create_study(study_name=f"{name}-baselines", storage=storage, direction="maximize")
-    for variant, score in (("SAC", 90.0), ("SAC", 91.0), ("CURL $x_{", 120.0)):
-        attrs = {"variant": variant, "environment": "x", "seed": int(score), "curve": [[1, score, 0.0]]}
-        baselines.add_trial(create_trial(value=score, user_attrs=attrs))
-    return study
+        trials.append(create_trial(value=score, params=params, distributions=space, user_attrs=attrs))
+    study.add_trials([*trials, create_trial(state=TrialState.FAIL)])
+    for variant, number, score in (("SAC", 0, 90.0), ("SAC", 1, 91.0), ("CURL $x_{", 0, 120.0)):
+        cell = Cell(variant, "Pendulum-v1", number)
+        path = cell_folder(folder / "baselines", cell)
+        prepare_run(path, tiny_run(seed=number))
+        write_about(path, cell._asdict())
+        write_curve(path / "curve.csv", [Evaluation(steps, score, 0.0, 1, 1.0) for steps in (200, 400)])
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Searches of which one is in runs/, written once: SQLite takes its time."""
+    folder = tmp_path_factory.mktemp("planted")
+    plant(folder / "runs/one", "one", 0, 60)
+    plant(folder / "two", "two", 1, 16)
+    plant(folder / "three", "three", 2, 16, f"sqlite:///{folder / 'two/study.db'}")
+    return folder
 
 
 @pytest.fixture
-def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> optuna.Study:
+def study(planted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> optuna.Study:
     """The only search in runs/."""
+    shutil.copytree(planted, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    return plant("runs/one", "one", 0)
+    return load_study(open_storage(Path("runs/one"), create=False), "one")
 
 
 @pytest.fixture
 def benchmark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Two variants, two seeds, two tasks; the last run has not begun."""
+    """Two variants, two seeds, two tasks; the last run has not started."""
     monkeypatch.chdir(tmp_path)
     folder = Path("runs/benchmark")
     for i, (variant, task, seed) in enumerate((v, t, s) for v in "ab" for t in ("walker-walk", "X-v0") for s in (0, 1)):
@@ -71,7 +92,6 @@ def benchmark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (path / "provenance.json").write_text(json.dumps(about))
         if i < 7:
             write_curve(path / "curve.csv", [Evaluation(1000 * j, 10.0 * i + j, 0.5, 5, 1.0) for j in (1, 2)])
-    (folder / "journal.log").touch()
     return folder
 
 
@@ -95,7 +115,7 @@ def test_analyze_writes_all_tables_as_data(study: optuna.Study) -> None:
         assert row["welch_p"] == pytest.approx(welch, rel=1e-9)
         assert (row["n_with"], row["n_without"]) == (len(classes[True]), len(classes[False]))
     assert {row["state"]: row["trials"] for row in data["population"]} == {
-        **dict.fromkeys(("pruned", "running", "waiting", "unusable"), 0),
+        **dict.fromkeys(("pruned", "running", "waiting", "interrupted", "unusable"), 0),
         **{"trials": 61, "analysed": 60, "fail": 1},
     }
     assert data["importances"][0]["parameter"] == "source/s_t"
@@ -121,30 +141,28 @@ def test_analyze_shows_whole_numbers_in_a_narrow_terminal(study: optuna.Study) -
 
 
 def test_analyze_compares_studies(study: optuna.Study) -> None:
-    plant("sqlite:///more.db", "two", 1)
-    plant("sqlite:///more.db", "three", 2)
-    shown = run("analyze", "--storage", "sqlite:///more.db", "--study", "three", "--study", "two").splitlines()
+    shown = run("analyze", "--storage", "sqlite:///two/study.db", "--study", "three", "--study", "two").splitlines()
     layout = shown[next(i for i, line in enumerate(shown) if "as the paper's table 5" in line) :]
     assert [line.split()[1] for line in layout if re.match("│ (two|three)", line)] == ["three", "two"]
-    plant("elsewhere/one", "one", 3)
-    shown = "\n".join(run("analyze", "runs/one", "elsewhere/one").splitlines())
-    assert "│ runs/one " in shown and "│ elsewhere/one " in shown
+    shutil.copytree("runs/one", "elsewhere/one")
+    output = run("analyze", "runs/one", "elsewhere/one")
+    assert "│ runs/one " in output and "│ elsewhere/one " in output
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["analyze", "nowhere"], "nowhere/journal.log does not exist"),
-        (["analyze", "--study", "other"], "no study 'other': the storage has one, one-baselines"),
+        (["analyze", "nowhere"], "nowhere/study.db does not exist"),
+        (["analyze", "--study", "other"], "no study 'other'. The storage has: one"),
         (["analyze", "runs/one", "runs/one", "--study", "one"], "there are 2 folders"),
         (["analyze", "runs/one", "runs/one"], "named twice: one, one"),
         (["analyze", "--pattern", "{s_t}"], "{s_t}"),
         (["figures", "patterns", "--pattern", "curll"], "nearest: curl"),
         (["figures", "evolution", "--out", "x.txt"], "x.txt: figures are written as"),
         (["figures", "curves"], "runs/benchmark has no learning curves"),
-        (["figures", "rankings", "--study", "one-baselines"], "no complete trial has a learning curve"),
+        (["figures", "evolution", "runs/benchmark"], "runs/benchmark has no study"),
     ],
-    ids=["folder", "study", "folders", "twice", "pattern", "name", "kind", "benchmark", "curves"],
+    ids=["folder", "study", "folders", "twice", "pattern", "name", "kind", "benchmark", "no search"],
 )
 def test_what_cannot_be_shown_is_one_line(study: optuna.Study, arguments: list[str], message: str) -> None:
     error = run(*arguments, fails=True)
@@ -167,9 +185,8 @@ def test_figures_of_a_search(study: optuna.Study, name: str) -> None:
 
 
 def test_figures_of_several_searches(study: optuna.Study) -> None:
-    plant("runs/two", "two", 1)
     for name in ("evolution", "histogram", "patterns"):
-        run("figures", name, "runs/one", "runs/two", "--out", f"{name}.svg")
+        run("figures", name, "runs/one", "two", "--out", f"{name}.svg")
         written = texts(Path(f"{name}.svg"))
         assert all(re.search(rf"\b{title}\b", written) for title in ("one", "two"))
 
@@ -180,18 +197,16 @@ def test_curves_of_a_benchmark(benchmark: Path) -> None:
     first = frame.query("variant == 'b' and env == 'walker-walk' and seed == 0 and environment_steps == 2000")
     assert first["mean"].tolist() == [42.0] and first["std"].tolist() == [0.5]
     output = run("figures", "curves", "--out", "curves.svg")
-    assert "Missing at 2,000: b on X-v0, seed 1: not begun" in output
+    assert "Missing at 2,000: b on X-v0, seed 1: not started" in output
     written = texts(Path("curves.svg"))
-    assert "walker-walk" in written and "a: 2 seeds, b: 1 seed (shade:" in written
+    assert "walker-walk" in written and "1 to 2 seeds (shade of one:" in written
     run("figures", "curves", benchmark, "--smooth", "2")
     assert (benchmark / "curves.png").exists()
     (benchmark / "b/X-v0/seed-0/curve.csv").write_text("a,b\n1,2\n")
     assert "b/X-v0/seed-0 is not what a benchmark leaves" in run("figures", "curves", fails=True)
 
 
-def test_a_benchmark_is_no_search_but_part_of_a_report(study: optuna.Study, benchmark: Path) -> None:
-    assert "is a benchmark, no search" in run("report", benchmark, fails=True)
-    assert "is a benchmark, no search" in run("figures", "evolution", benchmark, fails=True)
+def test_a_benchmark_is_part_of_a_report(study: optuna.Study, benchmark: Path) -> None:
     # The search is the only one in runs/.
     assert run("report", "--benchmark", "runs/benchmark") == "Report: runs/one/report.html\n"
     page = lxml.html.parse("runs/one/report.html").getroot()
@@ -200,15 +215,5 @@ def test_a_benchmark_is_no_search_but_part_of_a_report(study: optuna.Study, benc
     # Runs 0, 1 and 4, 5 are walker-walk's, 2, 3 and 6 the other's; each gives 10 i + 2.
     assert rows == [["X-v0", "27.0 ± 7.1", "62.0 (1/2)"], ["walker-walk", "7 ± 7", "47 ± 7"]]
     text = " ".join(page.text_content().split())
-    assert "Missing at 2,000: b on X-v0, seed 1: not begun" in text and "CURL $x_{" in text
+    assert "Missing at 2,000: b on X-v0, seed 1: not started" in text and "CURL $x_{" in text
     assert len(page.xpath("//figure/img[starts-with(@src, 'data:image/svg+xml;base64,')]")) == 3
-
-
-def test_the_help_needs_nothing_heavy() -> None:
-    program = (
-        "import sys; from typer.testing import CliRunner; from search.cli.main import app; "
-        "[CliRunner().invoke(app, [*of, '--help']) for of in ([], ['figures'], ['analyze'])]; "
-        "print([name for name in ('torch', 'optuna', 'pandas', 'matplotlib', 'plotly') if name in sys.modules])"
-    )
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
