@@ -282,6 +282,8 @@ def simulate_alone(screening: int) -> optuna.Study:
 def test_no_order_in_which_trials_finish_changes_a_loss(seed: int, n_running: int, screening: int) -> None:
     study, alone = simulate(seed, n_running, screening=screening), simulate_alone(screening)
     assert losses_of(study) == losses_of(alone)
+    forms = [loss.canonical() for loss in losses_of(study).values() if loss is not None]
+    assert len(set(forms)) == len(forms)  # nor does a candidate that replaces a failed one repeat another
     # An interrupted trial comes again with its loss, and no slot is filled twice.
     assert filled_slots(study) == filled_slots(alone) == all_slots(12, 12, 3)
     interrupted = [trial for trial in study.trials if "interrupted" in trial.user_attrs]
