@@ -90,11 +90,6 @@ def test_evolution_names_the_candidates():
     assert list(candidates.customdata[1]) == [1, "no loss", "-"]
 
 
-def test_evolution_of_nothing():
-    figure = evolution_figure(analysis.trial_table([]), BASELINES)
-    assert [len(trace.y) for trace in figure.data] == [0, 0, 0, 2, 2]
-
-
 def test_figures_are_plain_numbers(trials):
     """The plotly.js of the dashboard does not know the packed arrays of newer ones."""
     assert "bdata" not in evolution_figure(analysis.trial_table(trials), BASELINES).to_json()
@@ -375,6 +370,7 @@ def test_plots_of_studies_without_scores():
     table = analysis.trial_table(
         make_trials(make_trial(state=TrialState.FAIL), make_trial(state=TrialState.RUNNING, loss=None))
     )
+    assert [len(trace.y) for trace in evolution_figure(table, BASELINES).data] == [0, 0, 0, 2, 2]
     for figure in (
         evolution_plot({"new": table}, {"new": BASELINES}),
         histogram_plot({"new": table}),
