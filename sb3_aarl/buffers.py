@@ -330,7 +330,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :param batch_size: Number of transitions
         :param env: VecNormalize that observations and rewards go through
         :param crop_size: Height and width in pixels that images are cropped to at random while their frames are gathered,
-            each observation at a position of its own; None for no crop. n-step returns come without crops
+            each observation at a position of its own; None for no crop, as for n-step returns
         """
         positions = np.random.randint(0, self.size(), size=batch_size)
         return self._get_samples(positions, env, **({} if crop_size is None else {"crop_size": crop_size}))
@@ -339,7 +339,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self, batch_inds: np.ndarray, env: VecNormalize | None = None, crop_size: int | None = None
     ) -> ReplayBufferSamples | DictReplayBufferSamples:
         if self.n_steps > 1:
-            # SB3's own code draws from the arrays that this buffer only seems to have.
+            # SB3's own code, which reads ``observations`` and ``next_observations``.
             return super()._get_samples(batch_inds, env)
         envs = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
         # Observations and next ones together.
