@@ -1,6 +1,6 @@
 """AuxHead: source tokens -> predictor -> operator <- target tokens through the momentum encoder."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -43,11 +43,9 @@ class AuxHead(nn.Module):
         layers += [nn.BatchNorm1d(hidden)] if predictor_batch_norm else []
         self.predictor = nn.Sequential(*layers, nn.ReLU(), nn.Linear(hidden, target_dim))
         self.operator = Operator(loss.operator, loss.negatives, target_dim)
-        self.source_offsets = offsets(loss.source_tokens, "s")
-        self.target_offsets = offsets(loss.target_tokens, "s")
-        # The observations that a window has to hold, for WindowReplayBuffer.sample_windows: first the source's, then the
-        # target's. One that both name is there twice, so that images are augmented twice.
-        self.offsets = [*self.source_offsets, *self.target_offsets]
+        # The observations of a window, for WindowReplayBuffer.sample_windows: first the source's, then the target's. One
+        # that both name is there twice, so that images are augmented twice.
+        self.offsets = offsets(loss.source_tokens, "s") + offsets(loss.target_tokens, "s")
 
     def forward(
         self,
@@ -62,7 +60,7 @@ class AuxHead(nn.Module):
         :param encode: The encoder that is trained, from observations (n, ...) to latent states (n, latent_dim)
         :param encode_target: The momentum encoder; no gradient is kept of it
         """
-        n_source = len(self.source_offsets)
+        n_source = len(offsets(self.loss.source_tokens, "s"))
         source = self._embed(windows, self.loss.source_tokens, slice(n_source), encode)
         with th.no_grad():
             target = self._embed(windows, self.loss.target_tokens, slice(n_source, None), encode_target)
@@ -73,12 +71,11 @@ class AuxHead(nn.Module):
     def _embed(
         self,
         windows: WindowSamples,
-        tokens: Iterable[Token],
+        tokens: Sequence[Token],
         positions: slice,
         encode: Callable[[PyTorchObs], th.Tensor],
     ) -> th.Tensor:
         """Latent states, actions and rewards of the tokens side by side, (batch, d); all states in one encoder pass."""
-        tokens = tuple(tokens)
         batch = len(windows.actions)
         parts = []
         n_states = len(offsets(tokens, "s"))
@@ -91,13 +88,8 @@ class AuxHead(nn.Module):
         return th.cat(parts, dim=1)
 
 
-def offsets(tokens: Iterable[Token], kind: str) -> list[int]:
-    """
-    Offsets from the window's start of the tokens of one kind.
-
-    :param tokens: Tokens of a loss
-    :param kind: ``s``, ``a`` or ``r``
-    """
+def offsets(tokens: Sequence[Token], kind: str) -> list[int]:
+    """Offsets from the window's start of the tokens of one kind: ``s``, ``a`` or ``r``."""
     return [token.offset for token in tokens if token.kind == kind]
 
 

@@ -202,8 +202,7 @@ class AuxLoss:
 
 
 # Configurations are plain YAML: a loss is written as a mapping, never as a Python object.
-_C_DUMPERS = [getattr(yaml, name) for name in ("CSafeDumper", "CDumper") if hasattr(yaml, name)]
-for _dumper in (yaml.SafeDumper, yaml.Dumper, *_C_DUMPERS):
+for _dumper in (yaml.SafeDumper, yaml.Dumper):
     _dumper.add_representer(AuxLoss, lambda dumper, loss: dumper.represent_dict(loss.to_dict()))
 
 

@@ -12,10 +12,8 @@ Everything after the program's name is RL-Zoo's: see ``python -m sb3_aarl.rl_zoo
 """
 
 import argparse
-import ast
 import functools
 import importlib
-import reprlib
 import runpy
 import sys
 from collections.abc import Sequence
@@ -53,7 +51,7 @@ def register() -> None:
 
 
 def _make_env(env_id: str, render_mode: str | None = None, **env_kwargs: Any) -> gym.Env:
-    """``make_dmc_env`` for RL-Zoo, whose ``render_mode`` it does not need: SB3 shows arrays in a window where asked to."""
+    """``make_dmc_env`` for RL-Zoo, whose ``render_mode`` it does not need: SB3 shows its images in a window."""
     return make_dmc_env(env_id, **env_kwargs)
 
 
@@ -61,10 +59,10 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     """
     Arguments of ``train`` with the ``env_kwargs`` of its file of hyper-parameters as ``--env-kwargs``.
 
-    RL-Zoo gives those of the file to the environment of the training only. Those of the command line are noted with the
-    model and also reach evaluations, ``enjoy`` and ``record_video``. What is there already wins.
+    RL-Zoo passes those of the file to the training environment only; those of the command line are stored with the model
+    and reach evaluations, ``enjoy`` and ``record_video`` too. Given ones win.
 
-    :param arguments: RL-Zoo's arguments; the program ends with an error where ``sac_aux`` has no file, or no readable one
+    :param arguments: RL-Zoo's arguments; the program ends with an error where ``sac_aux`` has no readable file
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_aarl.rl_zoo train", add_help=False)
     parser.add_argument("--algo")
@@ -80,23 +78,15 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     try:
         with open(path, encoding="utf-8") as file:
             entries = yaml.safe_load(file)
-        env_kwargs = entries.get(known.env, entries.get("default", {})).get("env_kwargs", {})
-        values = [_as_python(key, value) for key, value in env_kwargs.items()]
-    except (OSError, yaml.YAMLError, AttributeError, ValueError) as error:
+        env_kwargs = dict(entries.get(known.env, entries.get("default", {})).get("env_kwargs", {}))
+    except (OSError, yaml.YAMLError, AttributeError) as error:
         parser.error(f"{path} is no file of hyper-parameters: {error}")
+    # RL-Zoo evaluates all behind the colon as Python.
+    for key, value in env_kwargs.items():
+        if not str(key).isidentifier():
+            parser.error(f"{path}: env_kwargs are arguments of an environment, not {key!r}: {value!r}")
+    values = [f"{key}:{value!r}" for key, value in env_kwargs.items()]
     return [*arguments, "--env-kwargs", *values, *known.env_kwargs] if values else list(arguments)
-
-
-def _as_python(key: Any, value: Any) -> str:
-    """For RL-Zoo, which evaluates what stands behind the colon: nothing that does more than to be a value."""
-    text = repr(value)
-    try:
-        is_plain = isinstance(key, str) and key.isidentifier() and ast.literal_eval(text) == value
-    except (ValueError, SyntaxError, RecursionError):
-        is_plain = False
-    if not is_plain:
-        raise ValueError(f"env_kwargs are arguments with plain values, not {reprlib.repr(key)}: {reprlib.repr(value)}")
-    return f"{key}:{text}"
 
 
 def main() -> None:

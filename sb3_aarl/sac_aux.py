@@ -47,8 +47,7 @@ class SACAux(SAC):
     unless another source is named; what differs there between tasks has the value of most tasks.
 
     :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
-    :param env: The environment, or its registered name (those of DeepMind Control once ``sb3_aarl.envs`` is imported: they
-        are for ``"MultiInputPolicy"``, while ``envs.make_dmc_env`` makes vectors or images of their observations)
+    :param env: The environment, or its registered name
     :param learning_rate: Of actor and critic, may be a schedule (1e-3; 2e-4 for Cheetah-Run)
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts
@@ -86,9 +85,8 @@ class SACAux(SAC):
     :param encoder_learning_rate: Of the auxiliary loss's optimizer, may be a schedule; None for ``learning_rate``
         (3e-3 for some pixel tasks). Without an auxiliary loss there is no such optimizer: the critic's trains the encoder
     :param joint_optimizer: False (default, CURL and the reference): the auxiliary loss has an optimizer of its own for
-        encoder and predictor, beside the critic's, which trains the encoder too (weight decay, if ``optimizer_kwargs`` has
-        one, then reaches the encoder from both). True (equation 1): one optimizer trains the encoder on the sum of both
-        losses, at ``encoder_learning_rate``
+        encoder and predictor, beside the critic's, which trains the encoder too. True (equation 1): one optimizer trains
+        the encoder on the sum of both losses, at ``encoder_learning_rate``
     :param predictor_width: Hidden units of the predictor (256), None for twice its input (the reference)
     :param predictor_batch_norm: Whether the predictor has batch norm (the paper names none, the reference has it)
     :param policy_delay: Gradient steps between updates of actor and entropy coefficient (2: CURL, the reference)
@@ -98,9 +96,9 @@ class SACAux(SAC):
         ``"random_shift"`` by up to 4 pixels, ``"none"``; ``"auto"`` crops if all images are larger than ``crop_size``
         and shifts if not. Vectors are never augmented
     :param crop_size: Height and width in pixels of cropped images, None for 84. Where it is given, images must not be smaller
-    :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16, while parameters, optimizers,
-        Q targets, entropy and losses stay float32. Predictions are made in float32. It is faster where the device has
-        instructions for bfloat16, and many times slower elsewhere (x86 processors without AVX-512; logs a warning)
+    :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16; parameters, optimizers, Q
+        targets, entropy, losses and predictions stay float32. Faster where the device has instructions for it, many times
+        slower elsewhere (x86 processors without AVX-512; logs a warning)
     :raises ValueError: for arguments that do not fit, with the culprit's name
 
     Training stops with :class:`NonFiniteError` where something is NaN or infinite, and with

@@ -126,22 +126,12 @@ def test_what_is_not_ours_stays(arguments: list[str]) -> None:
     assert with_env_kwargs(arguments) == arguments
 
 
-@pytest.mark.parametrize(
-    "env_kwargs",
-    [
-        """{"action_repeat:__import__('os').system('touch executed')or 2#": 1}""",
-        "{action repeat: 1}",
-        "{'': 1}",
-        "{1: 1}",
-        "{action_repeat: 2020-01-01}",
-        "{action_repeat: .inf}",
-    ],
-)
-def test_what_rl_zoo_would_evaluate_is_refused(env_kwargs: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "own.yml").write_text(f"default: {{env_kwargs: {env_kwargs}}}")
+@pytest.mark.parametrize("key", ["action_repeat:__import__('os').system('touch executed')or 2#", "action repeat", ""])
+def test_what_rl_zoo_would_evaluate_is_refused(key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.yml").write_text(f'default: {{env_kwargs: {{"{key}": 1}}}}')
     with pytest.raises(SystemExit):
         with_env_kwargs([*SAC_AUX, "-conf", str(tmp_path / "own.yml")])
-    assert "env_kwargs are arguments with plain values, not" in capsys.readouterr().err
+    assert "env_kwargs are arguments of an environment, not" in capsys.readouterr().err
 
 
 def test_plain_values_reach_rl_zoo_as_they_are(tmp_path: Path) -> None:
