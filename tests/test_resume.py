@@ -23,8 +23,6 @@ from search.training import checkpoint, run
 from search.training.checkpoint import TruncateAt, restart_seed
 from search.training.run import Run, prepare_run, train
 
-STEPS = 120
-EVERY = 30
 HYPER: dict[str, Any] = {
     "env_kwargs": {},
     "buffer_size": 1000,
@@ -36,19 +34,22 @@ HYPER: dict[str, Any] = {
 }
 PIXELS = {"pixels": True, "image_size": 16, "frame_stack": 2, "fast_rendering": True}
 CNN = {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8, "n_filters": 4}}
-# Episodes of 25, 50 or up to 1000 agent steps, evaluations every 30: most episodes are truncated there.
+# Episodes have 17, 25, 50 or up to 1000 agent steps: most are truncated at evaluations.
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "states": ("dm_control/cheetah-run-v0", {"env_kwargs": {"action_repeat": 40}}),
-    "pixels": ("dm_control/cartpole-swingup-v0", {"env_kwargs": {"action_repeat": 40, **PIXELS}, "policy_kwargs": CNN}),
+    "pixels": ("dm_control/cartpole-swingup-v0", {"env_kwargs": {"action_repeat": 60, **PIXELS}, "policy_kwargs": CNN}),
     "mujoco": ("Hopper-v5", {"env_kwargs": {"frame_stack": 2}, "train_freq": [1, "episode"], "gradient_steps": -1}),
     "normalize": ("InvertedPendulum-v5", {"normalize": True, "n_steps": 3}),
     "two": (
         "dm_control/reacher-easy-v0",
         {"env_kwargs": {"action_repeat": 20}, "n_envs": 2, "train_freq": 3, "gradient_steps": -1, "joint_optimizer": True},
     ),
-    "noise": ("Pendulum-v1", {"use_sde": True, "use_sde_at_warmup": True, "n_envs": 2, "normalize": {}}),
-    "warm-up": ("Pendulum-v1", {"learning_starts": 70, "sde_sample_freq": 4, "use_sde": True}),
+    # The second checkpoint lies between random actions.
+    "noise": ("Pendulum-v1", {"use_sde": True, "sde_sample_freq": 4, "n_envs": 2, "normalize": {}, "learning_starts": 70}),
 }
+# Agent steps between evaluations.
+EVERY = {case: 10 if case == "pixels" else 30 for case in CASES}
+N_EVALUATIONS = 4
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def make_run(case: str, **changes: Any) -> Run:
             "aux_loss": "{s_t, a_t} -> {s_t+1}",
             "hyperparameters": HYPER | hyper,
             "seed": 1,
-            "checkpoints": tuple(steps * repeat for steps in range(EVERY, STEPS + 1, EVERY)),
+            "checkpoints": tuple(EVERY[case] * repeat * (i + 1) for i in range(N_EVALUATIONS)),
             "evaluation_episodes": 1,
             "keep_model": True,
             **changes,
@@ -118,7 +119,6 @@ def train_in_process(folder: Path, kill: tuple[str, int] | None) -> None:
 def result(folder: Path) -> tuple[Any, Any]:
     """What a run leaves, without wall times."""
     model = SACAux.load(folder / "model.zip", device="cpu")
-    assert model.num_timesteps == STEPS
     return [point[:4] for point in read_curve(folder / "curve.csv")], model.training_state()
 
 
@@ -143,7 +143,7 @@ def assert_same(one: Any, other: Any, key: str = "") -> int:
 @pytest.mark.parametrize("case", CASES)
 def test_a_killed_run_ends_like_an_undisturbed_one(case: str, tmp_path: Path, processes: ForkServerContext) -> None:
     rng = np.random.default_rng(zlib.crc32(case.encode()))
-    step = int(rng.integers(EVERY + 1, 3 * EVERY))
+    step = int(rng.integers(EVERY[case] + 1, 3 * EVERY[case]))
 
     def train_until(folder: Path, kill: tuple[str, int] | None) -> int | None:
         process = processes.Process(target=train_in_process, args=(folder, kill))
@@ -159,10 +159,11 @@ def test_a_killed_run_ends_like_an_undisturbed_one(case: str, tmp_path: Path, pr
         prepare_run(folder, make_run(case))
         assert train_until(folder, kill) == (-signal.SIGKILL if kill else 0)
     starts = [int(line) for line in (folder / "starts").read_text().split()]
-    assert starts == [0, 0, (step - 1) // EVERY, (step - 1) // EVERY + 1]
+    n_evaluations = (step - 1) // EVERY[case]
+    assert starts == [0, 0, n_evaluations, n_evaluations + 1]
 
     (curve, state), (expected_curve, expected_state) = result(folder), result(tmp_path / "undisturbed")
-    assert curve == expected_curve and len(curve) == STEPS // EVERY
+    assert curve == expected_curve and len(curve) == N_EVALUATIONS
     assert assert_same(state, expected_state) > 40
     assert not (folder / "checkpoint.pt").exists() and not (folder / "checkpoint.tmp").exists()
 
@@ -174,7 +175,7 @@ def test_an_interrupted_run_ends_like_an_undisturbed_one(tmp_path: Path) -> None
         raise KeyboardInterrupt
 
     for name in ("undisturbed", "interrupted"):
-        prepare_run(tmp_path / name, make_run("normalize", checkpoints=(60, STEPS)))
+        prepare_run(tmp_path / name, make_run("normalize", checkpoints=(60, 120)))
     train(tmp_path / "undisturbed")
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path / "interrupted", on_evaluation=interrupt)
@@ -187,7 +188,7 @@ def test_another_seed_is_another_run(tmp_path: Path) -> None:
     """Else the tests above would be content with a constant."""
     curves = []
     for seed in (1, 2):
-        prepare_run(tmp_path / str(seed), make_run("warm-up", seed=seed, checkpoints=(60, STEPS)))
+        prepare_run(tmp_path / str(seed), make_run("normalize", seed=seed, checkpoints=(60, 120)))
         curves.append([point.mean for point in train(tmp_path / str(seed))])
     assert len({*curves[0], *curves[1]}) == 4
 

@@ -51,7 +51,7 @@ def restart_seed(seed: int, num_timesteps: int) -> int:
 
 def restart(model: SACAux, seed: int) -> None:
     """
-    Begin all episodes and random sequences anew, in an undisturbed run as in a resumed one.
+    Start new episodes and random sequences, in an undisturbed run as in a resumed one.
 
     :param model: The model, before the first action of a rollout
     :param seed: Seed of the run
@@ -64,8 +64,6 @@ def restart(model: SACAux, seed: int) -> None:
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
         model._last_original_obs = normalization.get_original_obs()
-    if model.action_noise is not None:
-        model.action_noise.reset()
     if model.use_sde:  # SB3 has drawn this rollout's noise before
         model.actor.reset_noise(env.num_envs)
 
@@ -129,7 +127,7 @@ def _normalization_state(env: VecNormalize | None) -> dict[str, Any]:
 
 def remove(folder: Path) -> None:
     """
-    Replay buffers are large.
+    Remove the checkpoint of a run: replay buffers are large.
 
     :param folder: Folder of the run
     """
@@ -143,7 +141,7 @@ class CheckpointCallback(BaseCallback):
 
     :param folder: Folder of the run
     :param seed: Seed of the run
-    :param curve: The learning curve, which ``LearningCurveCallback`` appends to
+    :param curve: The learning curve, extended by ``LearningCurveCallback``
     :param on_save: Called after each checkpoint; training ends if it returns False
     :param state: The checkpoint from which the run is resumed
     """

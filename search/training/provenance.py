@@ -30,27 +30,25 @@ def commit() -> str:
     no checkout. It is looked up once: a process keeps the code that it started with, whatever is checked out later.
     """
     root = Path(__file__).parents[2]
+    if not (root / ".git").exists():  # installed, perhaps inside another checkout
+        return metadata.version("sb3-aarl")
 
     def git(*arguments: str) -> bytes:
         return subprocess.run(["git", *arguments], cwd=root, capture_output=True, check=True).stdout.strip()
 
     try:
-        if not root.samefile(os.fsdecode(git("rev-parse", "--show-toplevel"))):  # installed inside another checkout
-            return metadata.version("sb3-aarl")
         changes = git("diff", "--no-ext-diff", "HEAD")
         digest = f"+changes.{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
         return git("rev-parse", "--short=12", "HEAD").decode() + digest
-    except (OSError, subprocess.CalledProcessError):
+    except (OSError, subprocess.CalledProcessError):  # no git
         return metadata.version("sb3-aarl")
 
 
 def cpu() -> str:
     """The processor's name, how many of its cores this process may use, and which of its instructions PyTorch uses."""
-    name = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        name = names[0] if names else name
+    model = re.search(r"model name\s*: (.+)", info.read_text()) if info.exists() else None
+    name = model[1] if model else platform.processor() or platform.machine()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return f"{name}, {cores} cores, {th.backends.cpu.get_cpu_capability()}"
 

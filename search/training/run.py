@@ -39,6 +39,8 @@ LOCK_SECONDS = 60.0
 # The evaluations of a run have this many seeds, from this one on; runs begin with others.
 EVALUATION_SEED = 10_000
 EVALUATION_SEEDS = 1_000_000
+# Evaluations are normalized with the statistics of training, and have the task's own rewards.
+FIXED = {"training": False, "norm_reward": False}
 # Hyper-parameters that do not change what is trained: the checkpoints say how long, and any device will do.
 FREE = ("n_timesteps", "device")
 
@@ -154,8 +156,8 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any]) -> gym.Env:
     """
     if env_id.startswith(PREFIX):
         return make_dmc_env(env_id, **env_kwargs)
-    render_mode = {"render_mode": "rgb_array"} if env_kwargs.get("pixels") else {}
-    return wrap_env(gym.make(env_id, **render_mode), **env_kwargs)
+    arguments: dict[str, Any] = {"render_mode": "rgb_array"} if env_kwargs.get("pixels") else {}
+    return wrap_env(gym.make(env_id, **arguments), **env_kwargs)
 
 
 def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
@@ -186,32 +188,26 @@ def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int
     return tuple(every * (i + 1) for i in range(n_evaluations))
 
 
-def _make_in_process(imports: Sequence[str], env_id: str, env_kwargs: Mapping[str, Any], steps: Sequence[int] = ()) -> gym.Env:
-    """An environment in a process of its own, perhaps, where nothing is imported yet."""
-    import_modules(imports)
+def _make_in_process(imports: Sequence[str], env_id: str, env_kwargs: Mapping[str, Any], steps: Sequence[int]) -> gym.Env:
+    import_modules(imports)  # the process may be one of the environment alone
     return checkpoint.TruncateAt(make_env(env_id, env_kwargs), steps)
 
 
 class _Setup:
-    """
-    What a run is trained with.
+    """What a run is trained with; its settings are from ``source``, in messages."""
 
-    :param run: The run
-    :param path: Its file, for messages
-    """
-
-    def __init__(self, run: Run, path: str):
+    def __init__(self, run: Run, source: str):
         self.run = run
         import_modules(run.imports)
-        settings = check_hyperparameters(run.hyperparameters, run.environment, path)
+        settings = check_hyperparameters(run.hyperparameters, run.environment, source)
         self.action_repeat, interval = action_repeat(settings), checkpoint_interval(settings)
         for steps in run.checkpoints:
             if steps % interval:
                 problem = f"is no multiple of train_freq x n_envs x action repeat, {interval} environment steps"
-                raise ConfigError(f"{path}: checkpoint {steps} {problem}")
+                raise ConfigError(f"{source}: checkpoint {steps} {problem}")
         train_freq = settings.get("train_freq")
         if isinstance(train_freq, tuple) and train_freq[1] == "episode" and train_freq[0] > 1:
-            raise ConfigError(f"{path}: train_freq must be 1 episode at most: a rollout has to end at each checkpoint")
+            raise ConfigError(f"{source}: train_freq must be 1 episode at most: a rollout has to end at each checkpoint")
         settings.pop("n_timesteps", None)
         self.env_kwargs: dict[str, Any] = settings.pop("env_kwargs", None) or {}
         self.pixels = self.env_kwargs.get("pixels", False)
@@ -237,33 +233,20 @@ class _Setup:
         return functools.partial(_make_in_process, self.run.imports, self.run.environment, self.env_kwargs, steps)
 
     def training_env(self, trained: int = 0) -> VecEnv:
-        """
-        The environments that the run is trained on.
-
-        :param trained: Environment steps that were trained before
-        """
-        before = [steps - trained for steps in self.run.checkpoints if steps > trained]
-        steps = [steps // self.action_repeat // self.n_envs for steps in before]
+        """Environments that are truncated at the checkpoints after so many environment steps of training."""
+        steps = [(steps - trained) // self.action_repeat // self.n_envs for steps in self.run.checkpoints]
         env = make_vec_env(self._make(steps), self.n_envs, seed=self.run.seed, vec_env_cls=self.vec_env)
         return env if self.normalize is None else VecNormalize(env, **self.normalize)
 
     def evaluation_env(self) -> VecEnv:
-        """The environments that it is evaluated on."""
         # From states a prediction takes as long as a step of an environment: one for all episodes. A picture takes much
         # longer than the prediction from it, and each environment that renders has tens of megabytes for it.
         episodes = self.run.evaluation_episodes
         n_envs, vec_env = (min(self.n_envs, episodes), self.vec_env) if self.pixels else (episodes, DummyVecEnv)
         env = make_vec_env(self._make(), n_envs, seed=0, vec_env_cls=vec_env, wrapper_class=SingleEpisodes)
-        if self.normalize is None:
-            return env
-        return VecNormalize(env, **{**self.normalize, "training": False, "norm_reward": False})
+        return env if self.normalize is None else VecNormalize(env, **{**self.normalize, **FIXED})
 
     def model(self, env: VecEnv) -> SACAux:
-        """
-        A new model.
-
-        :param env: What :meth:`training_env` returns
-        """
         return SACAux(self.policy, env, **self.settings)
 
 
@@ -367,11 +350,12 @@ def _description(run: Run) -> dict[str, Any]:
     """The keys of a run in ``provenance.json``."""
     values = run.model_dump(mode="json")
     names = ("environment", "aux_loss", "seed", "hyperparameters", "evaluation_episodes")
-    return {**{name: values[name] for name in names}, "aux_loss": str(run.aux_loss), "evaluations": values["checkpoints"]}
+    about = {name: values[name] for name in names}
+    return {**about, "aux_loss": str(run.aux_loss), "evaluations": values["checkpoints"]}
 
 
 def _end_with_stdin() -> None:
-    """End this process when whoever holds the other end of its standard input ends, or closes it."""
+    """End this process when its starter ends, or closes the pipe of its standard input."""
     while os.read(0, 1024):
         pass
     os._exit(1)
