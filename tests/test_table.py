@@ -264,7 +264,7 @@ def test_each_probability_is_over_the_tasks_of_its_two_variants(tmp_path: Path) 
         ("a", WALKER): np.array([5.0, 6.0]),
         ("b", WALKER): np.array([7.0, 8.0]),
         ("c", WALKER): np.array([5.5, 5.5]),
-        ("d", "Pendulum-v1"): np.array([-5.0]),  # with nobody in common
+        ("d", "Pendulum-v1"): np.array([-5.0]),  # with no task in common
     }
     plant_scores(tmp_path, scores)
     better = table.improvements(table.read_runs(tmp_path)).set_index(["variant", "over"])
@@ -278,7 +278,7 @@ def test_each_probability_is_over_the_tasks_of_its_two_variants(tmp_path: Path) 
     }
     assert better["n_tasks"].to_dict() == {pair: 2 if "c" not in pair else 1 for pair in better.index}
     shown = printed(tmp_path)
-    # Nobody but d was to be on Pendulum-v1, which is of another scale.
+    # Only d is planned on Pendulum-v1, which is of another scale.
     assert "At 100K not every variant has runs on cheetah-run: interquartile" in shown and shown.count("not every") == 1
     assert shown.count("Each probability is over the tasks that both variants have runs on") == 1
 

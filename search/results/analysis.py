@@ -54,7 +54,7 @@ HEADINGS = {
     **{"welch_p": "Welch p", "student_p": "Student p"},
 }
 COLUMNS: dict[str, Any] = {
-    **{"number": int, "state": str, "generation": int, "slot": "Int64", "operation": str, "parents": object, "score": float},
+    **{"number": int, "state": str, "generation": int, "operation": str, "parents": object, "score": float},
     **{"loss": object, "canonical": object, "horizon": "Int64", "operator": object, "negatives": "boolean", "curve": object},
 }
 
@@ -65,8 +65,8 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
 
     :param trials: Trials of a study
     :return: ``number``; ``state`` (``complete``, ``pruned``, ``fail``, ``interrupted``, ``running``, ``waiting``);
-        ``generation``; ``slot``; ``operation``; ``parents`` (numbers); ``score`` (NaN where there is none); ``loss`` (as it
-        was searched) and ``canonical``, both an AuxLoss or None; ``horizon`` (agent steps), ``operator``, ``negatives`` of the
+        ``generation``; ``operation``; ``parents`` (numbers); ``score`` (NaN where there is none); ``loss`` (as it was
+        searched) and ``canonical``, both an AuxLoss or None; ``horizon`` (agent steps), ``operator``, ``negatives`` of the
         loss; ``curve``, a list of (environment steps, mean return, standard deviation)
     """
     rows = []
@@ -76,7 +76,6 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
             "number": trial.number,
             "state": "interrupted" if trial.user_attrs.get("interrupted") else trial.state.name.lower(),
             "generation": generation_of(trial),
-            "slot": trial.user_attrs.get("slot"),
             "operation": operation_of(trial),
             "parents": parents_of(trial),
             "score": np.nan if score is None else score,
