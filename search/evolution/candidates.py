@@ -24,11 +24,7 @@ IsKnown = Callable[[AuxLoss], bool]  # whether the search has a canonical form a
 
 
 class Candidate(NamedTuple):
-    """
-    :param loss: A loss for one slot
-    :param operation: ``given``, ``random``, ``prior``, ``replacement``, ``crossover`` or ``horizon_change``
-    :param parents: Numbers of the trials that it stems from
-    """
+    """A loss for one slot, how it was made, and the numbers of the trials that it stems from."""
 
     loss: AuxLoss
     operation: str
@@ -36,17 +32,12 @@ class Candidate(NamedTuple):
 
 
 class Result(NamedTuple):
-    """
-    :param number: Number of the finished trial of a slot
-    :param loss: Its loss
-    :param score: Its score, higher is better
-    :param fitness: The same, minus infinity where it was pruned or is not finite
-    """
+    """The finished trial of a slot."""
 
     number: int
     loss: AuxLoss
-    score: float
-    fitness: float
+    score: float  # higher is better
+    fitness: float  # the score, minus infinity where the trial was pruned or its score is not finite
 
 
 class Candidates:

@@ -16,20 +16,12 @@ Bits = tuple[bool, ...]
 
 
 def is_valid(source: Sequence[bool] | np.ndarray, target: Sequence[bool] | np.ndarray) -> bool:
-    """
-    The paper's loss rejection (A.3): at least one state in the source, and a target that is not empty.
-
-    :param source: 3k + 1 booleans
-    :param target: 3k + 1 booleans
-    """
+    """The paper's loss rejection (A.3): at least one state in the source, and a target that is not empty."""
     return any(source[::3]) and any(target)
 
 
 def check_operators(operators: Sequence[str] | None) -> None:
-    """
-    :param operators: Names of operators, None where the operator is not searched
-    :raises ValueError: naming what is unknown
-    """
+    """Raise a ValueError that names what is no operator; None is where the operator is not searched."""
     unknown = [name for name in operators or () if name not in OPERATORS]
     if unknown or (operators is not None and (isinstance(operators, str) or not len(operators))):
         culprit = repr(unknown[0]) if unknown else repr(operators)
@@ -38,11 +30,7 @@ def check_operators(operators: Sequence[str] | None) -> None:
 
 @cache
 def token_names(horizon: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """
-    :param horizon: Horizon of a loss
-    :return: Names of the parameters of the source's bits, and of the target's
-    :raises ValueError: for what is no horizon
-    """
+    """Names of the parameters of the source's bits, and of the target's. Raises a ValueError for what is no horizon."""
     if horizon not in range(1, LONGEST_HORIZON + 1):
         raise ValueError(f"a horizon is a whole number from 1 to {LONGEST_HORIZON}, not {horizon!r}")
     tokens = [Token.of(index) for index in range(3 * int(horizon) + 1)]
@@ -99,11 +87,7 @@ def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
 
 
 def loss_of(trial: FrozenTrial) -> AuxLoss | None:
-    """
-    The loss of a trial; None if it was never asked for one, or has parameters that are no valid loss.
-
-    :param trial: The trial
-    """
+    """The loss of a trial; None if it was never asked for one, or has parameters that are no valid loss."""
     try:
         return params_to_loss(trial.params)
     except (KeyError, ValueError):
@@ -151,11 +135,7 @@ def _check_enqueued(trial: FrozenTrial, max_horizon: int, operators: Sequence[st
 
 
 def random_operator(rng: np.random.Generator, operators: Sequence[str] | None) -> tuple[str, bool]:
-    """
-    :param rng: Source of randomness
-    :param operators: As in :func:`distributions`
-    :return: Operator and whether it has negatives, uniform over all
-    """
+    """An operator and whether it has negatives, uniform over all."""
     if operators is None:
         return "mse", False
     return operators[int(rng.integers(len(operators)))], bool(rng.integers(2))
@@ -198,11 +178,8 @@ def forward_dynamics_prior(
     A loss that resembles forward dynamics (paper, A.3): states of the source Bernoulli(0.2), its actions
     Bernoulli(0.8), states of the target those that are not in the source, all other bits Bernoulli(0.5).
 
-    The paper prints "target" for the first of these; only with the source does its third rule make sense.
-
-    :param rng: Source of randomness
-    :param max_horizon: Longest horizon of the space
-    :param operators: As in :func:`random_loss`
+    The paper prints "target" for the first of these; only with the source does its third rule make sense. Arguments as in
+    :func:`random_loss`.
     """
 
     def draw_masks(horizon: int) -> tuple[np.ndarray, np.ndarray]:
@@ -220,11 +197,7 @@ def reward_prediction_prior(
 ) -> AuxLoss:
     """
     A loss that resembles reward prediction (paper, A.3): rewards of the target Bernoulli(0.8), no states and actions
-    in the target, the source Bernoulli(0.5).
-
-    :param rng: Source of randomness
-    :param max_horizon: Longest horizon of the space
-    :param operators: As in :func:`random_loss`
+    in the target, the source Bernoulli(0.5). Arguments as in :func:`random_loss`.
     """
 
     def draw_masks(horizon: int) -> tuple[np.ndarray, np.ndarray]:
