@@ -1,16 +1,11 @@
-"""Set before anything imports torch or dm_control: one thread for each test process, a renderer without a display, a key."""
+"""Set before anything imports torch or dm_control: one thread for each test process, a renderer without a display."""
 
 import os
 import sys
-import tempfile
 from collections.abc import Iterator
 
 for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
-# Checkpoints are signed with this key, not with the user's.
-os.environ.setdefault("AARL_KEY_FILE", os.path.join(tempfile.gettempdir(), f"sb3-aarl-tests-{os.getuid()}", "key"))
-# Ray forks in processes in which tests before used gRPC.
-os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")
 if sys.platform.startswith("linux"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
