@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from tiny import tiny_run
 
@@ -32,15 +33,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, flo
 
 def children() -> list[int]:
     """Processes of runs that this one has started."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parent = int(path.read_text().rsplit(")", 1)[1].split()[1])
-            if parent == os.getpid() and b"search.training.run" in (path.parent / "cmdline").read_bytes():
-                found.append(int(path.parent.name))
-        except OSError:
-            continue
-    return found
+    return [process.pid for process in psutil.Process().children() if "search.training.run" in process.cmdline()]
 
 
 def wait_done(submission: Submission) -> None:

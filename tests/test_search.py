@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import optuna
+import psutil
 import pytest
 from optuna.trial import TrialState
 from postgres import Postgres
@@ -46,8 +47,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Slots:
 
 def runs_of_driver(pid: int) -> list[int]:
     """Processes that train for a driver."""
-    output = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout
-    return [int(line) for line in output.split()]
+    return [process.pid for process in psutil.Process(pid).children() if "search.training.run" in process.cmdline()]
 
 
 def test_workers_and_driver_are_killed(tmp_path: Path, undisturbed: Slots) -> None:
@@ -67,8 +67,8 @@ def test_workers_and_driver_are_killed(tmp_path: Path, undisturbed: Slots) -> No
         left = runs_of_driver(process.pid)
         process.kill()
         process.communicate()
-        deadline = time.monotonic() + 10
-        while any(Path(f"/proc/{pid}").exists() for pid in left):
+        deadline = time.monotonic() + 60  # one that has just started has its imports to make first
+        while any(psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE for pid in left):
             assert time.monotonic() < deadline, "runs outlive their driver"
             time.sleep(0.1)
     assert slots(tmp_path) == undisturbed
