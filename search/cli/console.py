@@ -24,17 +24,18 @@ def say(text: object, style: str | None = None) -> None:
 
 
 @contextlib.contextmanager
-def live() -> Iterator[Callable[[RenderableType], None]]:
-    """A function that shows progress: in place on a terminal, elsewhere line by line and only what has changed."""
+def live() -> Iterator[Callable[[RenderableType, object], None]]:
+    """A function that shows progress: in place on a terminal, elsewhere as one more line where the state has changed."""
     if console.is_terminal:
         with Live(console=console, refresh_per_second=2) as display:
-            yield display.update
+            yield lambda shown, state: display.update(shown)
         return
-    shown: list[str] = []
+    last: object = None
 
-    def show(line: RenderableType) -> None:
-        if str(line) not in shown[-1:]:
-            shown.append(str(line))
+    def show(line: RenderableType, state: object) -> None:
+        nonlocal last
+        if state != last:
+            last = state
             say(line)
 
     yield show

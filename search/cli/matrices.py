@@ -34,7 +34,8 @@ def train_matrix(matrix: "Matrix", workers: int, retries: int = 3) -> None:
         for progress in run_matrix(matrix, executor, workers, retries):
             rest = f"{progress.failed} failed, {time_to_go(progress.seconds_to_go)}"
             bar.update(task, completed=progress.finished, rest=rest)
-            show(bar if console.is_terminal else f"{matrix.name}: {progress.finished}/{progress.total} runs, {rest}")
+            line = f"{matrix.name}: {progress.finished}/{progress.total} runs, {rest}"
+            show(bar if console.is_terminal else line, (progress.finished, progress.failed))
 
 
 def compare(matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str) -> "pd.DataFrame | None":

@@ -115,7 +115,7 @@ def show_progress(progresses: "Iterable[SearchProgress]") -> "SearchProgress | N
     shown = None
     with live() as show:
         for shown in progresses:
-            show(progress_table(shown) if console.is_terminal else progress_line(shown))
+            show(progress_table(shown) if console.is_terminal else progress_line(shown), shown.generations)
     return shown
 
 
