@@ -10,6 +10,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -268,6 +269,9 @@ class SACAux(SAC):
             )
 
     def _make_replay_buffer(self) -> WindowReplayBuffer:
+        # SB3's own check, for its own buffers only.
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        assert self.n_steps == 1 or not is_dict, "n-step returns are not supported for Dict observation spaces"
         # Kept for load() without an environment, where there are no wrappers to look at.
         if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
             self._frame_stack = detect_frame_stack(self.env)

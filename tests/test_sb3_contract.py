@@ -299,7 +299,7 @@ def test_n_step_returns() -> None:
     np.testing.assert_allclose(batch.rewards, (1 - batch.discounts) / (1 - 0.9), rtol=1e-5)
     lengths = np.round(np.log(batch.discounts.numpy()) / np.log(0.9)).ravel()
     assert set(lengths) == {1, 2, 3}
-    with pytest.raises(ValueError, match="n-step returns for Dict observations"):
+    with pytest.raises(AssertionError, match="Dict observation spaces"):
         make_model(RandomEnv(MIXED), "MultiInputPolicy", n_steps=3)
 
 
