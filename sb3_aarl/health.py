@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from torch import nn
 
 # A run whose Q values are this many times larger than rewards and entropy allow has diverged: healthy ones may overshoot
 # early in training, exploding ones pass a factor of a thousand on their way to infinity.
@@ -37,15 +36,6 @@ def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], place: s
             raise NonFiniteError(
                 f"{name}{f' {key!r}' if key else ''} from the environment is not finite at {place} (index {index})"
             )
-
-
-def non_finite_parameter(module: nn.Module) -> str | None:
-    """
-    The name of the first parameter that is NaN or infinite, None if all are finite.
-
-    :param module: A policy or any other module
-    """
-    return next((name for name, value in module.named_parameters() if not value.isfinite().all()), None)
 
 
 @dataclass

@@ -24,7 +24,7 @@ from sb3_aarl import catalog
 from sb3_aarl.aux_head import AuxHead
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
-from sb3_aarl.health import NonFiniteError, QValueCheck, check_finite, non_finite_parameter
+from sb3_aarl.health import NonFiniteError, QValueCheck, check_finite
 from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy
 
 logger = logging.getLogger(__name__)
@@ -524,10 +524,9 @@ class SACAux(SAC):
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         except ValueError as error:
             # PyTorch's distributions refuse NaN before any loss is computed, and know neither the step nor the cause.
-            culprit = non_finite_parameter(self.policy)
-            if culprit is None:
+            if "to satisfy the constraint" not in str(error):
                 raise
-            raise NonFiniteError(f"policy.{culprit} is not finite at {self._describe(self._n_updates)}") from error
+            raise NonFiniteError(f"an output of the actor is not finite at {self._describe(self._n_updates)}") from error
 
     def training_state(self) -> dict[str, Any]:
         """
