@@ -187,7 +187,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :param following: Whether to return the next observation instead; (...) is what it and positions broadcast to
         :param env: VecNormalize, which normalizes whole images: they are not cropped
         :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
-        :return: (..., *observation shape), height and width those of the crop; a dict for Dict observations
+        :return: (..., *observation shape) where they are stored, height and width those of the crop; a dict for Dict
+            observations
         """
         indices = positions * self.n_envs + envs
         # Positions before self.pos were written in this round of the ring, the others in the round before.
@@ -200,7 +201,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         observations: Any = parts if isinstance(self.observation_space, spaces.Dict) else parts[""]
         if env is not None:
             observations = env.normalize_obs(_map(lambda part: part.cpu().numpy(), observations))
-        return _map(lambda part: th.as_tensor(part, device=self.device), observations)
+        return _map(th.as_tensor, observations)
 
     def add(  # type: ignore[override]
         self,
@@ -346,9 +347,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
         both = self.gather(batch_inds, envs, np.array([[False], [True]]), env, crop_size)
         dones = self.dones[batch_inds, envs] * (1 - self.timeouts[batch_inds, envs])
         return (DictReplayBufferSamples if isinstance(both, dict) else ReplayBufferSamples)(
-            _map(lambda part: part[0], both),
+            _map(lambda part: part[0].to(self.device), both),
             self.to_torch(self.actions[batch_inds, envs]),
-            _map(lambda part: part[1], both),
+            _map(lambda part: part[1].to(self.device), both),
             self.to_torch(dones[:, None]),
             self.to_torch(self._normalize_reward(self.rewards[batch_inds, envs][:, None], env)),
         )
@@ -409,7 +410,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         # Gathered one offset after the other, so that all observations at some of the offsets are contiguous.
         observations = self.gather(steps[:, wanted - following].T, envs, following[:, None], env, crop_size)
         return WindowSamples(
-            _map(lambda part: part.transpose(0, 1), observations),
+            _map(lambda part: part.transpose(0, 1).to(self.device), observations),
             self.to_torch(self.actions[steps, envs[:, None]]),
             self.to_torch(self._normalize_reward(self.rewards[steps, envs[:, None], None], env)),
         )
