@@ -1,6 +1,6 @@
 """
-Does a search survive? Its runs are killed at random, its driver three times, PostgreSQL is restarted; it must end as if nothing
-had been: every slot with the loss and the score of an undisturbed search with one worker.
+Does a search survive? Its runs are killed at random, its driver three times, PostgreSQL is restarted; it must end as if
+nothing had been: every slot with the loss and the score of an undisturbed search with one worker.
 
     python benchmarks/soak.py [--storage sqlite postgresql] [--generations 4] [--kill-seconds 4]
 """

@@ -22,7 +22,7 @@ class RayExecutor:
         # "local" starts a new Ray also where RAY_ADDRESS names another one.
         ray.init(address=address or "local", log_to_driver=False, include_dashboard=False if address is None else None)
         # Ray would repeat a task on its own, and keep a worker's memory for the next one.
-        self._options = {"num_cpus": cpus, "num_gpus": gpus, "max_retries": 0, "max_calls": 1}
+        self._options: dict[str, Any] = {"num_cpus": cpus, "num_gpus": gpus, "max_retries": 0, "max_calls": 1}
         self._references: list[Any] = []
 
     def submit(self, fn: Callable[..., Any], /, *args: Any) -> Any:
@@ -39,7 +39,6 @@ class RayExecutor:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        _, running = ray.wait(self._references, num_returns=len(self._references), timeout=0) if self._references else ([], [])
-        for reference in running:
-            ray.cancel(reference, force=True)
+        for reference in self._references:
+            ray.cancel(reference, force=True)  # one that is over stays as it is
         ray.shutdown()
