@@ -159,6 +159,76 @@ class MLP(DenseMLP):
     dense = False
 
 
+class RunningNorm(nn.Module):
+    """
+    Observations with mean 0 and variance 1, by the running statistics of the batches that losses are computed on.
+
+    Predictions and the actor, which read the encoder without gradients, leave the statistics as they are.
+
+    :param size: Numbers of an observation
+    """
+
+    running_mean: th.Tensor
+    running_var: th.Tensor
+    running_batches: th.Tensor
+
+    def __init__(self, size: int):
+        super().__init__()
+        # SACAux copies buffers of these names to the momentum encoder.
+        self.register_buffer("running_mean", th.zeros(size))
+        self.register_buffer("running_var", th.ones(size))
+        self.register_buffer("running_batches", th.tensor(0.0))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        if self.training and th.is_grad_enabled():
+            with th.no_grad():
+                self.running_batches += 1
+                # The mean of the first batches, then an exponential average: batches are drawn from the whole buffer.
+                weight = (1 / self.running_batches).clamp(min=0.001)
+                difference = x.mean(dim=0) - self.running_mean
+                variance = x.var(dim=0, unbiased=False)
+                self.running_var.lerp_(variance + (1 - weight) * difference**2, weight)
+                self.running_mean += weight * difference
+        return (x - self.running_mean) / (self.running_var + 1e-5).sqrt()
+
+
+class SimbaBlock(nn.Module):
+    """
+    Residual block of SimBa (Lee et al., 2024): layer norm, a ReLU layer four times as wide, a projection back.
+
+    :param width: Width of input and output
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.layers = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.ReLU(), nn.Linear(4 * width, width))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return x + self.layers(x)
+
+
+class SimbaEncoder(BaseFeaturesExtractor):
+    """
+    Encoder in the manner of SimBa (Lee et al., 2024): running normalisation, a linear layer, residual blocks, layer norm.
+
+    :param observation_space: Any space that SB3 can flatten
+    :param features_dim: Width of the latent state and of all blocks
+    :param n_blocks: Number of residual blocks
+    :param normalize: Whether observations are normalised; VecNormalize would do the same before
+    """
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int = 128, n_blocks: int = 1, normalize: bool = True):
+        super().__init__(observation_space, features_dim)
+        inputs = get_flattened_obs_dim(observation_space)
+        self.normalization: nn.Module = RunningNorm(inputs) if normalize else nn.Identity()
+        blocks = [SimbaBlock(features_dim) for _ in range(n_blocks)]
+        self.layers = nn.Sequential(nn.Linear(inputs, features_dim), *blocks, nn.LayerNorm(features_dim))
+        self.layers.apply(orthogonal_init)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.layers(self.normalization(flat(observations)))
+
+
 class MultiInputEncoder(Encoder):
     """
     For Dict observations: a PixelEncoder for each image, one DenseMLP for all other keys together.
@@ -217,6 +287,7 @@ ENCODERS: Mapping[str, type[BaseFeaturesExtractor]] = {
     "pixel": PixelEncoder,
     "dense_mlp": DenseMLP,
     "mlp": MLP,
+    "simba": SimbaEncoder,
     "multi_input": MultiInputEncoder,
     "identity": FlattenExtractor,
 }

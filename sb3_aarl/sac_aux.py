@@ -411,6 +411,8 @@ class SACAux(SAC):
 
             if self._n_updates % self.target_update_interval == 0:
                 self._update_target()
+            # Running statistics of the encoder are copied, see SB3's issue 996.
+            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
         self._record(logs)
 
     def _sample(self, batch_size: int) -> tuple[ReplayBufferSamples, WindowSamples | None]:
@@ -461,8 +463,6 @@ class SACAux(SAC):
             polyak_update(self.critic.q_parameters(), self.critic_target.q_parameters(), self.tau)
             encoder, momentum_encoder = self.critic.features_extractor, self.critic_target.features_extractor
             polyak_update(encoder.parameters(), momentum_encoder.parameters(), self.encoder_tau)
-        # Running means of the encoder are copied, see SB3's issue 996.
-        polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
     def _record(self, logs: Mapping[str, Mapping[int, th.Tensor]]) -> None:
         """Log the means over gradient steps, and stop a run that has diverged."""

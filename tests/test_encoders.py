@@ -1,5 +1,7 @@
 """Encoders against naive forward passes, and their initialisation."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch as th
@@ -8,8 +10,19 @@ from scipy.signal import correlate
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import nn
+from torch.nn import functional as F
 
-from sb3_aarl.encoders import ENCODERS, MLP, DenseMLP, MultiInputEncoder, PixelEncoder, encoder_class
+from sb3_aarl import SACAux
+from sb3_aarl.encoders import (
+    ENCODERS,
+    MLP,
+    DenseMLP,
+    MultiInputEncoder,
+    PixelEncoder,
+    RunningNorm,
+    SimbaEncoder,
+    encoder_class,
+)
 
 
 def images(channels: int, height: int, width: int) -> spaces.Box:
@@ -185,11 +198,60 @@ def test_multi_input_encoder_is_its_parts_side_by_side(keys: list[str]) -> None:
     assert encoder.make_projection()(trunk).shape == latents.shape
 
 
+def test_simba_is_its_formula() -> None:
+    encoder = SimbaEncoder(vectors(3), features_dim=4)
+    randomize(encoder)
+    encoder.eval()
+    x = th.randn(6, 3)
+    norm, (linear, block, last) = encoder.normalization, encoder.layers
+    assert isinstance(norm, RunningNorm)
+    h = linear((x - norm.running_mean) / (norm.running_var + 1e-5) ** 0.5)
+    inner = F.layer_norm(h, (4,), block.layers[0].weight, block.layers[0].bias)
+    h = h + F.linear(F.linear(inner, *block.layers[1].parameters()).relu(), *block.layers[3].parameters())
+    th.testing.assert_close(encoder(x), F.layer_norm(h, (4,), last.weight, last.bias))
+
+
+def test_running_statistics_are_those_of_the_batches() -> None:
+    """Those of all observations of up to a thousand batches; where no gradient is computed nothing is learnt."""
+    norm, batches = RunningNorm(2), [th.randn(5, 2) * 3 + i for i in range(20)]
+    for batch in batches:
+        norm(batch)
+        with th.no_grad():
+            norm(batch + 100)
+    norm.eval()
+    norm(batches[0] + 100)
+    th.testing.assert_close(norm.running_mean, th.cat(batches).mean(dim=0))
+    th.testing.assert_close(norm.running_var, th.cat(batches).var(dim=0, unbiased=False))
+
+
+def test_running_statistics_are_shared_saved_and_not_learnt_from_predictions(tmp_path: Path) -> None:
+    policy = {"features_extractor_class": "simba", "features_extractor_kwargs": {"features_dim": 8}, "net_arch": [8]}
+    model = SACAux(
+        "MlpPolicy", "Pendulum-v1", learning_starts=10, batch_size=4, policy_kwargs=kwargs, target_update_interval=5
+    )
+
+    def statistics(some: SACAux) -> list[th.Tensor]:
+        encoders = some.critic.features_extractor, some.critic_target.features_extractor, some.actor.features_extractor
+        found = [[buffer.clone() for buffer in encoder.buffers()] for encoder in encoders]
+        assert all(th.equal(one, other) for others in found[1:] for one, other in zip(found[0], others, strict=True))
+        return found[0]
+
+    for steps in (11, 1, 1, 1):  # the target's parameters follow every fifth step, its statistics always
+        model.learn(steps, reset_num_timesteps=False)
+        before = statistics(model)
+    assert before[-1] > 0
+    model.predict(np.full((7, 3), 50.0, np.float32))
+    model.save(tmp_path / "model")
+    for some in (model, SACAux.load(tmp_path / "model")):
+        assert all(th.equal(one, other) for one, other in zip(before, statistics(some), strict=True))
+
+
 def test_names() -> None:
     expected = {
         "pixel": PixelEncoder,
         "dense_mlp": DenseMLP,
         "mlp": MLP,
+        "simba": SimbaEncoder,
         "multi_input": MultiInputEncoder,
         "identity": FlattenExtractor,
     }
@@ -201,6 +263,6 @@ def test_names() -> None:
 
     assert encoder_class(Own) is Own
     with pytest.raises(
-        ValueError, match="unknown encoder 'cnn', expected one of pixel, dense_mlp, mlp, multi_input, identity"
+        ValueError, match="unknown encoder 'cnn', expected one of pixel, dense_mlp, mlp, simba, multi_input, identity"
     ):
         encoder_class("cnn")
