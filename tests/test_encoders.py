@@ -227,7 +227,7 @@ def test_running_statistics_are_those_of_the_batches() -> None:
 def test_running_statistics_are_shared_saved_and_not_learnt_from_predictions(tmp_path: Path) -> None:
     policy = {"features_extractor_class": "simba", "features_extractor_kwargs": {"features_dim": 8}, "net_arch": [8]}
     model = SACAux(
-        "MlpPolicy", "Pendulum-v1", learning_starts=10, batch_size=4, policy_kwargs=kwargs, target_update_interval=5
+        "MlpPolicy", "Pendulum-v1", learning_starts=10, batch_size=4, policy_kwargs=policy, target_update_interval=5
     )
 
     def statistics(some: SACAux) -> list[th.Tensor]:
