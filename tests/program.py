@@ -17,7 +17,7 @@ def start(*arguments: object, folder: Path) -> subprocess.Popen[str]:
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
-        # Whoever runs the tests in the background (nohup, CI) may ignore Ctrl-C, and children inherit that.
+        # Tests in the background (nohup, CI) may ignore Ctrl-C, and children inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
