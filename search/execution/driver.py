@@ -48,7 +48,7 @@ class SearchProgress(NamedTuple):
 
 
 @dataclass
-class Candidate:
+class RunningTrial:
     """
     A trial whose runs are at the executor.
 
@@ -107,7 +107,7 @@ class Driver:
         self.workers = workers
         self.retries = retries
         self.on_change = on_change
-        self.candidates: dict[int, Candidate] = {}
+        self.running: dict[int, RunningTrial] = {}
         self.n_failures = 0
         # A database that is away for a while fails any of the calls; all may be repeated.
         self._patiently = Retrying(
@@ -131,20 +131,20 @@ class Driver:
         try:
             self._patiently(self._interrupt_unknown)
             while True:
-                for candidate in list(self.candidates.values()):
-                    self._check(candidate)
+                for running in list(self.running.values()):
+                    self._check(running)
                 while self._has_room() and self._patiently(self.sampler.free_slots, self.study) > 0:
                     self._start(self._patiently(self._ask))
                 yield self._patiently(self._progress)
-                if not self.candidates and self._patiently(self.sampler.is_complete, self.study):
+                if not self.running and self._patiently(self.sampler.is_complete, self.study):
                     return
                 time.sleep(POLL_SECONDS)
         finally:
-            for number in self.candidates:
+            for number in self.running:
                 self._interrupt(number)
 
     def _has_room(self) -> bool:
-        return sum(candidate.n_in_flight() for candidate in self.candidates.values()) < self.workers
+        return sum(running.n_in_flight() for running in self.running.values()) < self.workers
 
     def _ask(self) -> optuna.Trial:
         self._interrupt_unknown()  # of an ask that failed half way
@@ -153,7 +153,7 @@ class Driver:
     def _interrupt_unknown(self) -> None:
         """Give up trials of a driver that was killed: their slots get the same losses again, whose folders resume."""
         for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-            if trial.number not in self.candidates:
+            if trial.number not in self.running:
                 self._interrupt(trial.number)
 
     def _interrupt(self, number: int) -> None:
@@ -182,22 +182,22 @@ class Driver:
         self._note(trial, attributes)
         folder = candidate_folder(self.folder, trial)
         submissions = [Submission(self.executor, folder / f"seed-{run.seed}", run, self.retries) for run in runs]
-        self.candidates[trial.number] = Candidate(trial, submissions)
+        self.running[trial.number] = RunningTrial(trial, submissions)
         self._patiently(self.on_change, trial)
 
-    def _check(self, candidate: Candidate) -> None:
+    def _check(self, running: RunningTrial) -> None:
         """Report what a candidate's runs have evaluated, and tell when all of them are over."""
-        trial, submissions = candidate.trial, candidate.submissions
-        over = candidate.n_in_flight() == 0
+        trial, submissions = running.trial, running.submissions
+        over = running.n_in_flight() == 0
         curves = [submission.curve if over else partial_curve(submission.folder) for submission in submissions]
-        self._report(candidate, mean_curve(curves))
+        self._report(running, mean_curve(curves))
         failure = next((submission.failure for submission in submissions if submission.failure is not None), None)
         if failure is not None and not over:
-            candidate.stop()
+            running.stop()
         if not over:
             return
         session = read_about(submissions[0].folder).get("sessions", [{}])[-1]
-        device = f"CPU: {session.get('cpu')}" if session.get("gpu", "none") == "none" else f"GPU: {session['gpu']}"
+        device = f"GPU: {session['gpu']}" if "cuda" in session.get("device", "") else f"CPU: {session.get('cpu')}"
         seconds = round(sum(curve[-1].seconds for curve in curves if curve), 1)
         self._note(trial, {"curve": mean_curve(curves), "seconds": seconds, "device": device})
         checkpoints = submissions[0].run.checkpoints
@@ -209,14 +209,14 @@ class Driver:
             self.n_failures = 0
             self._tell(trial, values=score(curves))
 
-    def _report(self, candidate: Candidate, curve: list[list[float]]) -> None:
+    def _report(self, running: RunningTrial, curve: list[list[float]]) -> None:
         """Report a step when all seeds have it."""
-        trial, news = candidate.trial, curve[candidate.n_reported :]
+        trial, news = running.trial, curve[running.n_reported :]
         for steps, mean, _ in news:
             self._patiently(trial.report, mean, int(steps))
-            candidate.n_reported += 1
-            if steps != candidate.submissions[0].run.checkpoints[-1] and self._patiently(trial.should_prune):
-                candidate.stop()
+            running.n_reported += 1
+            if steps != running.submissions[0].run.checkpoints[-1] and self._patiently(trial.should_prune):
+                running.stop()
         if news:
             self._patiently(self.on_change, trial)
 
@@ -235,7 +235,7 @@ class Driver:
     def _tell(self, trial: optuna.Trial, values: float | None = None, state: TrialState | None = None) -> None:
         self._patiently(self.on_change, trial)
         self._patiently(self.study.tell, trial, values, state, skip_if_finished=True)
-        self.candidates.pop(trial.number, None)
+        self.running.pop(trial.number, None)
 
     def _progress(self) -> SearchProgress:
         generations = self.sampler.progress(self.study)
@@ -243,7 +243,7 @@ class Driver:
         best = self.study.best_trial if complete else None
         seconds = [trial.duration.total_seconds() for trial in complete if trial.duration is not None]
         left = sum(generation.slots - generation.filled for generation in generations)
-        at_once = max(1, len(self.candidates))
+        at_once = max(1, len(self.running))
         return SearchProgress(
             generations,
             None if best is None else best.value,

@@ -16,7 +16,7 @@ from sb3_aarl.callbacks import aulc, replace_text
 from sb3_aarl.envs import PREFIX
 from search.execution.runs import Executor, Submission, partial_curve
 from search.training.provenance import read_about, write_about
-from search.training.run import Run, is_finished, prepare_run, read_outcome
+from search.training.run import FAILED, Run, is_finished, prepare_run, read_outcome
 
 POLL_SECONDS = 0.5
 
@@ -129,7 +129,7 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
             if submission.failure is not None and not is_finished(submission.folder):
                 failed.add(cell)
                 note = {"reason": submission.failure, "retry": True}
-                replace_text(submission.folder / "failed.json", json.dumps(note) + "\n")
+                replace_text(submission.folder / FAILED, json.dumps(note) + "\n")
         left = len(waiting) + len(in_flight)
         over = n_waiting - left
         to_go = (time.monotonic() - started) / over * left if over else None

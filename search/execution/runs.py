@@ -13,17 +13,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from sb3_aarl.callbacks import Evaluation, read_curve
-from search.training.run import Run, is_finished, prepare_run, read_outcome
+from search.training.run import CURVE, LOCKED, RUN, STOP, Run, is_finished, prepare_run, read_outcome
 
 logger = logging.getLogger(__name__)
 
 OUTPUT = "output.log"
-CURVE = "curve.csv"
-STOP = "stop"
+_thread = threading.local()  # the executor of a thread, if it is a LocalExecutor's
 
 
 class RunFailed(RuntimeError):
-    """Candidate after candidate failed, or runs could not be started; the message has the last reason."""
+    """Candidate after candidate failed; the message has the last reason."""
 
 
 class Future(Protocol):
@@ -40,10 +39,6 @@ class Executor(Protocol):
     def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future: ...
 
 
-_processes: set[subprocess.Popen[bytes]] = set()
-_shutting_down = threading.Event()
-
-
 def start_run(folder: str) -> dict[str, Any]:
     """
     Train the run of a folder in a process of its own, which ends when this one does, and wait for it.
@@ -54,36 +49,38 @@ def start_run(folder: str) -> dict[str, Any]:
     :return: Plain values: ``curve`` (rows of ``Evaluation``), ``failure`` (None, or the reason in one line) and ``retry``
         (whether the failure was not the candidate's fault)
     """
-    path = Path(folder)
-    if not is_finished(path):
-        threads = str(Run.model_validate_json((path / "run.json").read_text(encoding="utf-8")).threads)
-        command = [sys.executable, "-m", "search.training.run", folder, "--end-with-stdin"]
-        environment = {**os.environ, "OMP_NUM_THREADS": threads}
-        # A session of its own: Ctrl-C reaches the driver only, whose end closes the pipe.
-        with (path / OUTPUT).open("ab") as output:
-            process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment, start_new_session=True
-            )
-        _processes.add(process)
-        try:
-            if _shutting_down.is_set():
-                process.kill()
-            code = process.wait()
-        finally:
-            _processes.discard(process)
-            if process.stdin is not None:
-                process.stdin.close()
-        if code and read_outcome(path) is None:
-            how = f"signal {-code}" if code < 0 else f"exit code {code}"
-            return {
-                "curve": _rows(path),
-                "failure": f"the run's process was killed ({how}), see {path / OUTPUT}",
-                "retry": True,
-            }
+    path, code = Path(folder), 0
+    while not is_finished(path):
+        code = _train(path)
+        if code != LOCKED:  # another process trains it, such as one that outlived its driver: its outcome is waited for
+            break
+    if code and read_outcome(path) is None:
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        return {"curve": _rows(path), "failure": f"the run's process was killed ({how}), see {path / OUTPUT}", "retry": True}
     outcome = read_outcome(path)
     if outcome is None:  # it was told to stop
         return {"curve": _rows(path), "failure": None, "retry": False}
     return {"curve": [list(row) for row in outcome.curve], "failure": outcome.failure, "retry": outcome.retry}
+
+
+def _train(folder: Path) -> int:
+    """Train a run in a process, whose exit code is returned."""
+    threads = Run.model_validate_json((folder / RUN).read_text(encoding="utf-8")).threads
+    command = [sys.executable, "-m", "search.training.run", str(folder), "--end-with-stdin"]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    # A session of its own: Ctrl-C reaches the driver only, whose end closes the pipe.
+    with (
+        (folder / OUTPUT).open("ab") as output,
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment, start_new_session=True
+        ) as process,
+    ):
+        executor = getattr(_thread, "executor", None)
+        if executor is not None:
+            executor.processes.append(process)
+            if executor.is_closed:
+                process.kill()
+        return process.wait()
 
 
 def _rows(folder: Path) -> list[list[float]]:
@@ -124,12 +121,16 @@ class LocalExecutor(ThreadPoolExecutor):
     """
 
     def __init__(self, workers: int = 1):
-        super().__init__(workers, thread_name_prefix="run")
-        _shutting_down.clear()
+        super().__init__(workers, thread_name_prefix="run", initializer=self._own_thread)
+        self.processes: list[subprocess.Popen[bytes]] = []
+        self.is_closed = False
+
+    def _own_thread(self) -> None:
+        _thread.executor = self
 
     def __exit__(self, *exception: Any) -> None:
-        _shutting_down.set()  # for threads that are just starting a process
-        for process in list(_processes):
+        self.is_closed = True  # for threads that are just starting a process
+        for process in self.processes:
             process.kill()
         self.shutdown(wait=True, cancel_futures=True)
 

@@ -36,6 +36,7 @@ FAILED = "failed.json"
 STOP = "stop"
 LOCK = "lock"
 LOCK_SECONDS = 60.0
+LOCKED = 75  # exit code: another process trains the run
 # The evaluations of a run have this many seeds, from this one on; runs begin with others.
 EVALUATION_SEED = 10_000
 EVALUATION_SEEDS = 1_000_000
@@ -375,7 +376,8 @@ def main() -> None:
     try:
         train(arguments.folder)
     except Timeout as error:  # the process that trains it writes the outcome
-        sys.exit(str(error))
+        logger.warning("%s", error)
+        sys.exit(LOCKED)
     except Exception as error:
         outcome = {"reason": _one_line(error), "retry": not isinstance(error, FloatingPointError)}
         replace_text(arguments.folder / FAILED, json.dumps(outcome) + "\n")
