@@ -69,7 +69,7 @@ def test_replacement_of_long_losses(horizon: int) -> None:
 def test_crossover_takes_every_bit_from_one_of_both(loss: AuxLoss, other: AuxLoss, seed: int) -> None:
     rng = np.random.default_rng(seed)
     if loss.horizon != other.horizon:
-        with pytest.raises(ValueError, match="one horizon"):
+        with pytest.raises(ValueError):
             crossover(loss, other, rng)
         return
     try:

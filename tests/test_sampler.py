@@ -483,11 +483,11 @@ def test_an_enqueued_loss_is_trained_in_a_random_slot() -> None:
         trial = study.ask()
         study.tell(trial, score(suggest_aux_loss(trial, 2)))
     study.enqueue_trial(loss_to_params(WANTED))
-    study.enqueue_trial({"horizon": 2, "source/s_t": False, "target/r_t+1": True})
+    study.enqueue_trial({"horizon": 2, "source/s_t": True, "target/r_t+1": True})
     trials = [study.ask() for _ in range(2)]
     assert suggest_aux_loss(trials[0], 2) == WANTED
     partly = suggest_aux_loss(trials[1], 2)
-    assert (partly.horizon, partly.source[0], partly.target[5]) == (2, False, True)
+    assert (partly.horizon, partly.source[0], partly.target[5]) == (2, True, True)
     for trial in trials:
         assert key_of(trial)[0] == 2 and sampler_of(study).operations(2)[key_of(trial)[1]] == "random"
         assert (trial.user_attrs["operation"], trial.user_attrs["parents"]) == ("enqueued", [])
@@ -510,7 +510,11 @@ def test_an_enqueued_loss_that_is_invalid_costs_nothing() -> None:
     assert {key: loss for key, loss in losses_of(study).items() if loss} == losses_of(run(make_study()))
 
 
-@pytest.mark.parametrize("given", [loss_to_params(WANTED), {"horizon": 2, "rate": 0.25}], ids=["whole", "partial"])
+@pytest.mark.parametrize(
+    "given",
+    [loss_to_params(WANTED), {"horizon": 2, "source/s_t": True, "target/r_t": True, "rate": 0.25}],
+    ids=["whole", "partial"],
+)
 @pytest.mark.parametrize("suggests", [True, False])
 def test_an_interrupted_enqueued_trial_comes_again(given: dict[str, Any], suggests: bool) -> None:
     study = make_study()

@@ -3,8 +3,8 @@
 import contextlib
 import logging
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -65,13 +65,7 @@ class Candidates:
         self.n_seen: dict[int, int] = {}
 
     def of_slot(self, generation: int, slot: int, attempt: int) -> Candidate:
-        """
-        The candidate of a slot.
-
-        :param generation: Number of the generation, from 1
-        :param slot: Number of the slot, from 0
-        :param attempt: How many candidates of this slot failed
-        """
+        """The candidate of a slot of a generation (from 1), of which ``attempt`` candidates have failed."""
         if slot >= len(self.sampler.operations(generation)):
             return self._draw(generation, slot, 0, self.seen.__contains__)
         if attempt == 0:
@@ -93,29 +87,8 @@ class Candidates:
             attempts.add(candidate.loss.canonical())
         return candidate
 
-    def with_given(self, given: Mapping[str, Any], key: Sequence[int]) -> AuxLoss | None:
-        """
-        A loss with given parameters, the others at random.
-
-        :param given: Parameters that were enqueued
-        :param key: Seed
-        :return: None where no valid loss has these parameters
-        """
-        rng, operators = np.random.default_rng(key), self.sampler.operators
-        for _ in range(MAX_DRAWS):
-            drawn = space.loss_to_params(space.random_loss(rng, self.sampler.max_horizon, operators), operators)
-            with contextlib.suppress(KeyError, TypeError, ValueError):
-                loss = space.params_to_loss({**drawn, **given})
-                space.loss_to_params(loss, operators)
-                return loss
-        return None
-
     def end_generation(self, results: Sequence[Result]) -> None:
-        """
-        Choose the parents of the next generation.
-
-        :param results: Results of this one in the order of slots, which is the order of equal ones
-        """
+        """Choose the parents of the next generation; results are in the order of slots, which is the order of equal ones."""
         while self.to_plan:
             self._plan_next()
         for result in results:

@@ -22,8 +22,6 @@ def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str
     """
     Flip each bit of both masks with probability 1 / (2 (3k + 1)), k being the horizon, independently.
 
-    :param loss: The parent
-    :param rng: Source of randomness
     :param operators: Operators that are searched too (the paper does not say how): with the same probability each, the
         operator is redrawn and negatives are switched; None to keep both
     :raises RejectedLoss: when the offspring is not valid
@@ -40,16 +38,10 @@ def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str
 
 def crossover(loss: AuxLoss, other: AuxLoss, rng: np.random.Generator) -> AuxLoss:
     """
-    Take each bit of both masks, and the operator, from one of two parents at random.
+    Take each bit of both masks, and the operator, from one of two parents of one horizon at random.
 
-    :param loss: One parent
-    :param other: Another of the same horizon
-    :param rng: Source of randomness
     :raises RejectedLoss: when the offspring is not valid
-    :raises ValueError: when the horizons differ
     """
-    if loss.horizon != other.horizon:
-        raise ValueError(f"crossover needs parents of one horizon, not of {loss.horizon} and {other.horizon}")
     from_other = rng.random((2, 3 * loss.horizon + 1)) < 0.5
     source, target = np.where(from_other, (other.source, other.target), (loss.source, loss.target)).tolist()
     operator = loss if rng.random() < 0.5 else other
@@ -62,9 +54,6 @@ def horizon_change(loss: AuxLoss, rng: np.random.Generator, max_horizon: int = M
 
     Both ways are equally probable; at the ends of 1..max_horizon only one is left.
 
-    :param loss: The parent
-    :param rng: Source of randomness
-    :param max_horizon: Longest horizon of the space
     :raises RejectedLoss: when the offspring is not valid, or the space has one horizon only
     """
     ways = [change for change in (-1, 1) if 1 <= loss.horizon + change <= max_horizon]

@@ -6,7 +6,7 @@ import math
 import threading
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,7 +56,7 @@ class AuxLossSampler(BaseSampler):
     A trial gets its slot when it is asked for, and shows it in its user attributes ``generation``, ``slot``, ``attempt``,
     ``operation`` and ``parents``. Its loss depends on the seed, the slot and earlier generations, not on the number of trials
     that run at once. A failed trial frees its slot for another candidate, or for the same one if it has the user attribute
-    ``interrupted``. An enqueued trial takes a random slot if there is one.
+    ``interrupted``. An enqueued trial takes a random slot if there is one; what was not enqueued is drawn at random.
 
     Asking never waits. A trial that finds no free slot gets one more offspring of the last parents and a slot number behind
     all others; it counts if it finishes before its generation is over. Trials of a killed program stay RUNNING and hold their
@@ -67,8 +67,7 @@ class AuxLossSampler(BaseSampler):
     :param n_prior: Losses of the first generation from the priors, both in turn (paper: 25)
     :param parents: Share of a generation that the next one stems from (paper: 0.25)
     :param replacement: Share of flipped masks (paper: 0.5)
-    :param crossover: Share of crossovers (paper: 0.2), of two parents of one horizon. Where no two parents have one, the
-        second is any candidate of the generation; where there is none either, the slot gets a replacement
+    :param crossover: Share of crossovers (paper: 0.2), of two parents of one horizon; without such a pair, of replacements
     :param horizon_change: Share of changed horizons (paper: 0.1)
     :param random: Share of random losses (paper: 0.2)
     :param max_horizon: Longest horizon (paper: 10)
@@ -179,7 +178,7 @@ class AuxLossSampler(BaseSampler):
             return  # Optuna's copy of a trial whose heartbeat stopped
         with LOCK:
             slots = self._refresh(study)
-            assigned = slots.assign(trial.number, trial.system_attrs.get(FIXED_KEY, trial.params or None))
+            assigned = slots.assign(trial.number, is_enqueued=FIXED_KEY in trial.system_attrs or bool(trial.params))
             for key, value in assigned.items():
                 study._storage.set_trial_system_attr(trial._trial_id, key, value)
         trial.system_attrs.update(assigned)
@@ -230,13 +229,7 @@ class AuxLossSampler(BaseSampler):
 
 
 class _Slots:
-    """
-    The trials of a study by their slots, as far as the storage shows them.
-
-    :param sampler: The settings
-    :param seed: Seed of the study
-    :param sign: -1 where scores are minimized
-    """
+    """The trials of a study by their slots, as far as the storage shows them; ``sign`` is -1 where scores are minimized."""
 
     def __init__(self, sampler: AuxLossSampler, seed: int, sign: float):
         self.sampler = sampler
@@ -304,16 +297,12 @@ class _Slots:
         failed = sum(number for (of, _), number in self.failed.items() if of == generation)
         return GenerationProgress(generation, size, size - len(unfilled), running, failed)
 
-    def assign(self, number: int, given: Mapping[str, Any] | None) -> dict[str, Any]:
-        """
-        The system attributes of a trial that is asked for.
-
-        :param number: Number of the trial
-        :param given: Parameters that were enqueued, None if it was not
-        """
+    def assign(self, number: int, is_enqueued: bool) -> dict[str, Any]:
+        """The system attributes of the trial of this number, which is asked for."""
         free = self.free()
-        if given is not None:  # no offspring is lost, if that can be
-            free.sort(key=lambda at: (at in self.interrupted, self.sampler.operations(at[0])[at[1]] != "random"))
+        if is_enqueued:  # an interrupted slot keeps its loss; no offspring is lost, if that can be
+            free = [at for at in free if at not in self.interrupted]
+            free.sort(key=lambda at: self.sampler.operations(at[0])[at[1]] != "random")
         if not free:
             generation = int(min(self.candidates.generation, self.last))
             free = [(generation, len(self.sampler.operations(generation)) + number)]
@@ -321,9 +310,8 @@ class _Slots:
             logger.warning("Trial %d is one more of generation %d: trials %s hold its slots", number, generation, others)
         (generation, slot), attempt = free[0], self.failed[free[0]]
         key = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
-        if given is not None:
-            loss = self.candidates.with_given(given, list(key.values()))
-            return {SLOT_KEY: {**key, "operation": "enqueued", "parents": [], "loss": loss and str(loss)}}
+        if is_enqueued:
+            return {SLOT_KEY: {**key, "operation": "enqueued", "parents": [], "loss": None}}
         if again := self.interrupted.get(free[0]):
             return {name: value for name, value in again.system_attrs.items() if name in (SLOT_KEY, FIXED_KEY)}
         loss, operation, parents = self.candidates.of_slot(generation, slot, attempt)

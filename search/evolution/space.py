@@ -1,6 +1,6 @@
 """The search space: AuxLoss to and from Optuna parameters, and losses drawn at random and from the paper's priors."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -145,14 +145,21 @@ def _draw(
     rng: np.random.Generator,
     max_horizon: int,
     operators: Sequence[str] | None,
-    draw_masks: Callable[[int], tuple[np.ndarray, np.ndarray]],
+    source: Sequence[float] = (0.5, 0.5, 0.5),
+    target: Sequence[float] = (0.5, 0.5, 0.5),
+    flips_states: bool = False,
 ) -> AuxLoss:
+    """A loss whose states, actions and rewards are in source and target with given probabilities, invalid ones redrawn."""
     # The horizon is drawn once: redrawing it with rejected masks would favour long ones.
     horizon = int(rng.integers(1, max_horizon + 1))
-    source, target = draw_masks(horizon)
-    while not is_valid(source, target):
-        source, target = draw_masks(horizon)
-    return AuxLoss(horizon, tuple(source.tolist()), tuple(target.tolist()), *random_operator(rng, operators))
+    chances = np.array([np.resize(kinds, 3 * horizon + 1) for kinds in (source, target)])
+    while True:
+        masks = rng.random(chances.shape) < chances
+        if flips_states:
+            masks[1, ::3] = ~masks[0, ::3]
+        if is_valid(*masks):
+            of_source, of_target = map(tuple, masks.tolist())
+            return AuxLoss(horizon, of_source, of_target, *random_operator(rng, operators))
 
 
 def random_loss(rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
@@ -163,12 +170,7 @@ def random_loss(rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operat
     :param max_horizon: Longest horizon of the space
     :param operators: Operators to draw from, None for mean squared error without negatives
     """
-
-    def draw_masks(horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        source, target = rng.random((2, 3 * horizon + 1)) < 0.5
-        return source, target
-
-    return _draw(rng, max_horizon, operators, draw_masks)
+    return _draw(rng, max_horizon, operators)
 
 
 def forward_dynamics_prior(
@@ -181,15 +183,7 @@ def forward_dynamics_prior(
     The paper prints "target" for the first of these; only with the source does its third rule make sense. Arguments as in
     :func:`random_loss`.
     """
-
-    def draw_masks(horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        chances = np.full((2, 3 * horizon + 1), 0.5)
-        chances[0, ::3], chances[0, 1::3] = 0.2, 0.8
-        source, target = rng.random(chances.shape) < chances
-        target[::3] = ~source[::3]
-        return source, target
-
-    return _draw(rng, max_horizon, operators, draw_masks)
+    return _draw(rng, max_horizon, operators, source=(0.2, 0.8, 0.5), flips_states=True)
 
 
 def reward_prediction_prior(
@@ -199,14 +193,7 @@ def reward_prediction_prior(
     A loss that resembles reward prediction (paper, A.3): rewards of the target Bernoulli(0.8), no states and actions
     in the target, the source Bernoulli(0.5). Arguments as in :func:`random_loss`.
     """
-
-    def draw_masks(horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        chances = np.zeros((2, 3 * horizon + 1))
-        chances[0], chances[1, 2::3] = 0.5, 0.8
-        source, target = rng.random(chances.shape) < chances
-        return source, target
-
-    return _draw(rng, max_horizon, operators, draw_masks)
+    return _draw(rng, max_horizon, operators, target=(0.0, 0.0, 0.8))
 
 
 PRIORS = (forward_dynamics_prior, reward_prediction_prior)
