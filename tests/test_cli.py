@@ -235,12 +235,12 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(name: str, monke
     optuna.create_study(study_name="some", storage=open_storage(Path("runs/some")))
     served = []
 
-    def serve(storage: BaseStorage, artifacts: Path, host: str, port: int) -> None:
-        served.append((optuna.get_all_study_names(storage), artifacts, host, port))
+    def serve(storage: BaseStorage, host: str, port: int) -> None:
+        served.append((optuna.get_all_study_names(storage), host, port))
 
-    monkeypatch.setattr("search.results.dashboard.serve", serve)
+    monkeypatch.setattr("optuna_dashboard.run_server", serve)
     run("dashboard", name, "--port", 8123)
-    assert served == [(["some"], Path("runs/some/artifacts"), "127.0.0.1", 8123)]
+    assert served == [(["some"], "127.0.0.1", 8123)]
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,6 @@ from search.results.plots import (
     evolution_figure,
     evolution_plot,
     histogram_plot,
-    learning_curve_png,
     learning_curves_figure,
     learning_curves_plot,
     patterns_plot,
@@ -104,17 +103,6 @@ def test_learning_curves_of_trials_that_have_one():
     assert figure.data[0].error_y.array == (0.5, 0.25)
     looks = {(trace.line.dash, trace.marker.symbol) for trace in learning_curves_figure(trials[:1] * 5).data}
     assert len(looks) == 5  # they differ in grey
-
-
-@pytest.mark.parametrize("slope", [1, -1])
-def test_png_of_a_learning_curve(slope):
-    curve = [(step, slope * step / 100, 1.0) for step in range(0, 1000, 100)]
-    image = matplotlib.image.imread(io.BytesIO(learning_curve_png(curve, r"$\{s_t\} \rightarrow \{s_{t+1}\}$")))
-    assert image.shape[:2] == (456, 768)
-    line = np.abs(image[..., :3] - np.array([0x1F, 0x4E, 0x79]) / 255).max(-1) < 0.02
-    # The lowest pixels of the line at both ends: a legend lies above it.
-    left, right = (np.nonzero(line[:, columns])[0].max() for columns in (slice(0, 200), slice(560, 768)))
-    assert (right - left) * slope < -50  # rows are counted from above
 
 
 def test_ranked_and_losses(trials):

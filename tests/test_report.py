@@ -24,7 +24,7 @@ from sb3_aarl.callbacks import Evaluation, write_curve
 from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
 from search.execution.matrix import Cell, cell_folder
 from search.results import analysis
-from search.results.notation import mathml, subscripts
+from search.results.notation import mathml
 from search.results.report import generation_table, stored_baselines, stored_runs, write_report
 from search.training.provenance import write_about
 from search.training.run import Run, prepare_run
@@ -51,12 +51,6 @@ def test_mathml_reads_as_the_notation(loss):
 
     text = read(ElementTree.fromstring(f"<p>{mathml(loss)}</p>"))
     assert AuxLoss.parse(text) == loss
-
-
-@given(losses())
-def test_subscripts_read_as_the_notation(loss):
-    plain = subscripts(loss).translate(str.maketrans("ₜ₊₀₁₂₃₄₅₆₇₈₉", "t+0123456789"))
-    assert AuxLoss.parse(re.sub(r"\b([sar])t", r"\1_t", plain)) == loss
 
 
 def make_trial(number, state, value, duration, loss=None, **attrs):

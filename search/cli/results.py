@@ -156,9 +156,11 @@ def dashboard(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
 ) -> None:
-    """Watch a search in optuna-dashboard."""
+    """Watch a search in optuna-dashboard. Everybody who reaches it can change and delete studies."""
+    from optuna_dashboard import run_server
+
     from search.execution.storage import load_study, open_storage
-    from search.results.dashboard import ARTIFACTS, serve, update_plots
+    from search.results.dashboard import update_plots
     from search.results.report import stored_baselines
     from search.studies.search import SETTINGS_KEY
 
@@ -170,4 +172,4 @@ def dashboard(
             update_plots(study, stored_baselines(path or Path("runs") / name))
     say(f"http://{host}:{port}/  (Ctrl-C to stop)")
     with suppress(KeyboardInterrupt):
-        serve(opened, (path or Path("runs")) / ARTIFACTS, host, port)
+        run_server(opened, host=host, port=port)

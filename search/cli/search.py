@@ -91,18 +91,17 @@ def search(
 
 def annotations(study: "Study", config: "SearchConfig", folder: Path) -> "Callable[[Trial], None]":
     """Write the note of a study; the function that is returned keeps the notes of its trials and its plot up to date."""
-    from search.results.dashboard import annotate_study, annotate_trial, artifacts, update_plots
+    from search.results.dashboard import annotate_study, annotate_trial, update_plots
     from search.results.report import stored_baselines
     from search.studies.search import settings
     from search.training.provenance import provenance
 
     annotate_study(study, settings(config), provenance())
-    pictures = artifacts(folder)
     drawn = -PLOT_SECONDS
 
     def annotate(trial: "Trial") -> None:
         nonlocal drawn
-        annotate_trial(study, trial, pictures)
+        annotate_trial(study, trial)
         if time.monotonic() - drawn > PLOT_SECONDS:
             drawn = time.monotonic()
             update_plots(study, stored_baselines(folder))

@@ -1,29 +1,20 @@
-"""optuna-dashboard for searches: notes of the study and its trials, the evolution plot, and the server."""
+"""optuna-dashboard for searches: notes of the study and its trials, and the evolution plot."""
 
-import io
 import math
 import re
-import tempfile
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from optuna import Study, Trial
-from optuna.artifacts import FileSystemArtifactStore, get_all_artifact_meta, upload_artifact
-from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial
-from optuna_dashboard import run_server, save_note, save_plotly_graph_object
-from optuna_dashboard.artifact import get_artifact_path
+from optuna_dashboard import save_note, save_plotly_graph_object
 
 from sb3_aarl.aux_loss import AuxLoss
 from search.results.analysis import trial_table
-from search.results.notation import subscripts
-from search.results.plots import evolution_figure, learning_curve_png
-from search.results.trials import Curve, curve_of, generation_of, lineage, loss_of, operation_of, parents_of, score_of
+from search.results.plots import evolution_figure
+from search.results.trials import curve_of, generation_of, lineage, loss_of, operation_of, parents_of, score_of
 
-ARTIFACTS = "artifacts"  # folder of the pictures in notes
-PICTURE = "learning-curve.png"
 PLOT_ID = "evolution"
 # Notes are attributes of the study, of which every page of the dashboard reads all.
 MAX_ANCESTORS = 12
@@ -39,25 +30,8 @@ experience which others are predicted. Its value is the area under its learning 
 so that their importances are the tokens'."""
 
 
-def artifacts(folder: Path) -> FileSystemArtifactStore:
-    """
-    Where the pictures of a search are.
-
-    :param folder: Folder of the search, made if it is not there
-    """
-    path = folder / ARTIFACTS
-    path.mkdir(parents=True, exist_ok=True)
-    return FileSystemArtifactStore(path)
-
-
 def annotate_study(study: Study, settings: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
-    """
-    Write the study's note: what is searched, with which settings, on which commit, and how to read it.
-
-    :param study: The study
-    :param settings: Names and values of its settings
-    :param provenance: As returned by ``search.training.provenance.provenance``
-    """
+    """Write the study's note: what is searched, with which settings, on which commit, and how to read it."""
     note = [f"## Search for auxiliary losses: {_escape(study.study_name)}", HOW_TO_READ]
     for heading, values in (("Settings", settings), ("Where it comes from", provenance)):
         rows = [(_escape(name), _escape(value)) for name, value in values.items()]
@@ -65,14 +39,10 @@ def annotate_study(study: Study, settings: Mapping[str, Any], provenance: Mappin
     save_note(study, "\n\n".join(note))
 
 
-def annotate_trial(study: Study, trial: Trial, artifact_store: FileSystemArtifactStore | None = None) -> None:
+def annotate_trial(study: Study, trial: Trial) -> None:
     """
-    Write or replace the note of a running trial: its loss, where it comes from, and its learning curve so far. State and
-    score are shown beside it by the dashboard.
-
-    :param study: The study
-    :param trial: The trial
-    :param artifact_store: Where the picture of the learning curve goes; None for the table alone
+    Write or replace the note of a running trial: its loss, where it comes from, and its learning curve so far. State, score
+    and the plot of intermediate values are shown beside it by the dashboard.
     """
     trials = study.get_trials(deepcopy=False)
     frozen = trials[trial.number]
@@ -87,8 +57,6 @@ def annotate_trial(study: Study, trial: Trial, artifact_store: FileSystemArtifac
         points = curve[:: -len(curve) // MAX_CURVE_ROWS][::-1]
         rows = [(steps, f"{mean:.1f}", "-" if math.isnan(std) else f"{std:.1f}") for steps, mean, std in points]
         note += ["#### Learning curve", _table(("environment steps", "mean", "std"), rows)]
-        if artifact_store is not None:
-            note.append(f"![Learning curve]({_picture(trial, loss, curve, artifact_store)})")
     if ancestors := lineage(frozen, trials):
         nearest = sorted(ancestors[:MAX_ANCESTORS], key=lambda ancestor: -ancestor.number)
         header = ("trial", "generation", "from", "score", "loss")
@@ -99,27 +67,9 @@ def annotate_trial(study: Study, trial: Trial, artifact_store: FileSystemArtifac
 
 
 def update_plots(study: Study, baselines: Iterable[tuple[str, float]] = ()) -> None:
-    """
-    Write or replace the evolution plot of the study. It holds every candidate: once a generation is often enough.
-
-    :param study: The study
-    :param baselines: Names and scores of horizontal lines
-    """
+    """Write or replace the evolution plot of the study, with names and scores of baselines as horizontal lines."""
     figure = evolution_figure(trial_table(study.get_trials(deepcopy=False)), baselines, study.direction)
     save_plotly_graph_object(study, figure, graph_object_id=PLOT_ID)
-
-
-def serve(storage: BaseStorage, artifact_path: str | Path, host: str = "127.0.0.1", port: int = 8080) -> None:
-    """
-    Serve optuna-dashboard until it is interrupted. Everybody who reaches it can change and delete studies.
-
-    :param storage: The storage of the studies
-    :param artifact_path: Folder of the artifact store, made if it is not there
-    :param host: Address to listen on; by default this machine's own, which no other machine reaches
-    :param port: Port to listen on
-    """
-    Path(artifact_path).mkdir(parents=True, exist_ok=True)
-    run_server(storage, host=host, port=port, artifact_store=FileSystemArtifactStore(artifact_path))
 
 
 def _loss_lines(trial: FrozenTrial, loss: AuxLoss | None) -> list[str]:
@@ -127,12 +77,8 @@ def _loss_lines(trial: FrozenTrial, loss: AuxLoss | None) -> list[str]:
     if loss is None:
         return [f"### Trial {trial.number}", "It has no valid loss."]
     canonical = f"Canonical: `{loss.canonical()}`" if loss.canonical() != loss else "This is its canonical form."
-    latex = "\n".join(_wrap(loss.latex(), 80))
-    return [f"### {subscripts(loss)}", f"```latex\n{latex}\n```", f"Notation: `{loss}`", canonical]
-
-
-def _wrap(latex: str, width: int) -> list[str]:
-    return textwrap.wrap(latex, width, break_long_words=False, break_on_hyphens=False)
+    latex = textwrap.fill(loss.latex(), 80, break_long_words=False, break_on_hyphens=False)
+    return [f"### `{loss}`", f"```latex\n{latex}\n```", canonical]
 
 
 def _origin(trial: FrozenTrial) -> str:
@@ -146,20 +92,6 @@ def _ancestor(trial: FrozenTrial) -> tuple[Any, ...]:
     origin = _escape(" ".join([operation_of(trial), *map(str, parents_of(trial))]))
     notation = f"`{textwrap.shorten(str(loss), 100, placeholder=' …')}`" if loss else "-"
     return trial.number, generation_of(trial), origin, "-" if score is None else f"{score:.1f}", notation
-
-
-def _picture(trial: Trial, loss: AuxLoss | None, curve: Curve, store: FileSystemArtifactStore) -> str:
-    """The path of the curve's picture on the server; there is one for each trial, drawn again when the curve grows."""
-    typeset = [f"${line}$" for line in _wrap(loss.latex(), 130)] if loss else []
-    picture = learning_curve_png(curve, "\n".join([f"Trial {trial.number}", *typeset]))
-    uploaded = [meta.artifact_id for meta in get_all_artifact_meta(trial) if meta.filename == PICTURE]
-    if uploaded:
-        store.write(uploaded[0], io.BytesIO(picture))
-        return get_artifact_path(trial, uploaded[0])
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, PICTURE)
-        path.write_bytes(picture)
-        return get_artifact_path(trial, upload_artifact(artifact_store=store, file_path=str(path), study_or_trial=trial))
 
 
 def _escape(text: object) -> str:

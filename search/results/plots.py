@@ -1,6 +1,5 @@
 """Figures of a study, as pure functions of its trials: plotly for the dashboard and the report, matplotlib for files."""
 
-import io
 import math
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ from optuna.trial import FrozenTrial
 from sb3_aarl.aux_loss import AuxLoss
 from search.results import analysis
 from search.results.rankings import leading, rank_agreement, rankings
-from search.results.trials import Curve, curve_of
+from search.results.trials import curve_of
 
 # Lines differ by dash and marker, not by colour alone: they have to be told apart in grey.
 DASHES = ("dash", "dot", "dashdot", "longdash", "longdashdot")
@@ -142,26 +141,6 @@ def _style(figure: go.Figure, title: str, x_label: str, y_label: str) -> None:
     )
     figure.update_xaxes(title={"text": x_label}, **AXIS)
     figure.update_yaxes(title={"text": y_label, "standoff": 12}, automargin=True, **AXIS)
-
-
-def learning_curve_png(curve: Curve, title: str) -> bytes:
-    """
-    A learning curve as a picture.
-
-    :param curve: Environment steps, mean return and standard deviation of every evaluation
-    :param title: Title, in matplotlib's notation (``$...$`` is typeset)
-    """
-    steps, means, deviations = np.transpose(curve)
-    figure, (axes,) = _panels([title], columns=1, width=6.4, height=3.2)
-    axes.plot(steps, means, "o-", color=BLUE, label="mean of the episodes")
-    low, high = means - deviations, means + deviations
-    axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, linewidth=0, label="± standard deviation")
-    axes.set_ylabel("Return")
-    axes.legend(frameon=False)
-    _step_axis(axes)
-    file = io.BytesIO()
-    figure.savefig(file, format="png")
-    return file.getvalue()
 
 
 def evolution_plot(
