@@ -222,12 +222,12 @@ def test_evolution_plot_draws_what_the_tables_say(tables):
 
 
 def test_histogram_is_in_percent_of_each_study(tables):
-    figure = histogram_plot(tables, bins=12)
+    figure = histogram_plot(tables)
     (axes,) = figure.axes
     for name, table in tables.items():
         scores = table["score"][table["state"] == "complete"]
         both = np.concatenate([other["score"][other["state"] == "complete"] for other in tables.values()])
-        edges = np.linspace(both.min(), both.max(), 13)
+        edges = np.linspace(both.min(), both.max(), 26)
         counts = np.histogram(scores, edges)[0]
         path = next(patch.get_xy() for patch in axes.patches if patch.get_label() == name)
         for count, left, right in zip(counts, edges[:-1], edges[1:], strict=True):

@@ -7,7 +7,7 @@ import typer
 
 from search.cli import options
 from search.cli.console import say
-from search.cli.options import SearchFolders, Storage, StudyNames, open_studies
+from search.cli.options import SearchFolders, Storage, open_studies
 from search.cli.results import patterns_by_name, say_missing
 
 if TYPE_CHECKING:
@@ -24,12 +24,12 @@ Studies = dict[str, "tuple[Study, Path]"]
 
 
 @app.command()
-def evolution(folders: SearchFolders = None, storage: Storage = None, study: StudyNames = None, out: Out = None) -> None:
+def evolution(folders: SearchFolders = None, storage: Storage = None, out: Out = None) -> None:
     """Scores of all candidates by generation, with the baselines that are trained (figures 4 and 6)."""
     from search.results.plots import evolution_plot
     from search.results.report import stored_baselines
 
-    studies = open_studies(folders, storage, study)
+    studies = open_studies(folders, storage)
     directions = {found.direction for found, _ in studies.values()}
     if len(directions) > 1:
         raise ValueError(f"some of {', '.join(studies)} are maximized and some minimized: draw them separately")
@@ -41,15 +41,13 @@ def evolution(folders: SearchFolders = None, storage: Storage = None, study: Stu
 def histogram(
     folders: SearchFolders = None,
     storage: Storage = None,
-    study: StudyNames = None,
-    bins: Annotated[int, typer.Option(help="Number of bins.", min=1)] = 25,
     out: Out = None,
 ) -> None:
     """Distribution of the scores of up to three searches, such as with and without pruning of the space (figure 7)."""
     from search.results.plots import histogram_plot
 
-    studies = open_studies(folders, storage, study)
-    write_figure(histogram_plot(candidates(studies), bins), out, "histogram", studies)
+    studies = open_studies(folders, storage)
+    write_figure(histogram_plot(candidates(studies)), out, "histogram", studies)
 
 
 @app.command()
@@ -71,14 +69,13 @@ def curves(
 def rankings(
     folder: options.SearchFolder = None,
     storage: Storage = None,
-    study: options.StudyName = None,
     top: options.Top = 10,
     out: Out = None,
 ) -> None:
     """Learning curves of the best candidates under three metrics (figure 10)."""
     from search.results.plots import rankings_plot
 
-    studies = open_studies([folder], storage, [study])
+    studies = open_studies([folder], storage)
     (table,) = candidates(studies).values()
     write_figure(rankings_plot(table, top), out, "rankings", studies)
 
@@ -87,16 +84,14 @@ def rankings(
 def patterns(
     folders: SearchFolders = None,
     storage: Storage = None,
-    study: StudyNames = None,
     pattern: options.Patterns = None,
-    ties_without: options.Ties = False,
     out: Out = None,
 ) -> None:
     """Scores with and without each pattern of table 5 (figure 11)."""
     from search.results.plots import patterns_plot
 
-    studies = open_studies(folders, storage, study)
-    write_figure(patterns_plot(candidates(studies), patterns_by_name(pattern), ties_without), out, "patterns", studies)
+    studies = open_studies(folders, storage)
+    write_figure(patterns_plot(candidates(studies), patterns_by_name(pattern)), out, "patterns", studies)
 
 
 def candidates(studies: Studies) -> "dict[str, pd.DataFrame]":

@@ -106,7 +106,6 @@ def select_operator(config: SearchFile, workers: Workers = 1, threads: Threads =
 @app.command()
 def cross_validate(
     config: SearchFile,
-    study: Annotated[str | None, typer.Option(help="Study of the search. Default: the configuration file's name.")] = None,
     top: Annotated[int | None, typer.Option(help="How many candidates. Default: the file's.", min=1)] = None,
     storage: Storage = None,
     workers: Workers = 1,
@@ -119,7 +118,7 @@ def cross_validate(
 
     settings = read_config(config, threads=threads)
     path = run_folder(config, folder)
-    searched = load_study(open_storage(path, storage, create=False), study or settings.name)
+    searched = load_study(open_storage(path, storage, create=False), settings.name)
     matrix = cross_validation.make_matrix(settings, searched, path, top)
     train_matrix(matrix, workers, settings.retries)
     table = compare(matrix, cross_validation.ranking, "Cross-validation, AULC")

@@ -23,17 +23,18 @@ SearchFolders = Annotated[
     list[Path] | None, Argument(help="Folders of searches, or their configuration files. Default: the only one in runs/.")
 ]
 Storage = Annotated[
-    str | None, Option(help="URL of a database, such as postgresql://user@host/db. Default: SQLite in the search's folder.")
+    str | None,
+    Option(
+        help="URL of a database, such as postgresql://user@host/db; the study has the name of the search's folder, which need "
+        "not be there. Default: SQLite in the folder."
+    ),
 ]
-StudyName = Annotated[str | None, Option(help="Name of the study. Default: the folder's name.")]
-StudyNames = Annotated[list[str] | None, Option(help="Name of a study; may be repeated. Default: the folder's name.")]
 Workers = Annotated[int, Option(help="Runs at the same time, each in a process of its own.", min=1)]
 Threads = Annotated[int | None, Option(help="Threads of each run. Default: the configuration's.", min=1)]
 Patterns = Annotated[
     list[str] | None,
     Option(help='A pattern beside those of table 5, in notation or by name, such as "{s_t} -> {r_t}"; may be repeated.'),
 ]
-Ties = Annotated[bool, Option("--ties-without", help="Count n_target = n_source as not n_target > n_source.")]
 Top = Annotated[int, Option(help="How many of the best candidates the metrics are compared on.", min=1)]
 
 
@@ -68,25 +69,17 @@ def search_folder(folder: Path | None, storage: str | None) -> Path | None:
     return folders[0]
 
 
-def open_studies(
-    folders: Sequence[Path | None] | None, storage: str | None, names: Sequence[str | None] | None
-) -> "dict[str, tuple[Study, Path]]":
-    """Studies and their folders by name, one of each folder or several of one storage; by folder where names are alike."""
+def open_studies(folders: Sequence[Path | None] | None, storage: str | None) -> "dict[str, tuple[Study, Path]]":
+    """Studies and their folders by name; by folder where names are alike."""
     from search.execution.storage import load_study, open_storage
 
-    folders, names = folders or [None], names or [None]
-    if names != [None] and len(folders) > 1:
-        raise ValueError(f"--study names studies of one folder or --storage, but there are {len(folders)} folders")
-    found = []
-    for folder in folders:
+    found = {}
+    for folder in folders or [None]:
         path = search_folder(folder, storage)
         opened = open_storage(path, storage, create=False)
-        for name in names:
-            # Studies and folders are called alike, unless both are named.
-            study = load_study(opened, name or (path.name if path else None))
-            found.append((study, path or Path("runs") / study.study_name))
-    alike = len({study.study_name for study, _ in found}) < len(found)
-    studies = {str(path) if alike else study.study_name: (study, path) for study, path in found}
-    if len(studies) < len(found):
-        raise ValueError(f"a study is named twice: {', '.join(study.study_name for study, _ in found)}")
-    return studies
+        # The file in a folder has one study; of those in a database it is the one with the folder's name.
+        is_shared = storage is not None or len(opened.get_all_studies()) > 1
+        study = load_study(opened, path.name if path is not None and is_shared else None)
+        found[path or Path("runs") / study.study_name] = study
+    alike = len({study.study_name for study in found.values()}) < len(found)
+    return {str(path) if alike else study.study_name: (study, path) for path, study in found.items()}

@@ -76,9 +76,7 @@ def say_missing(runs: "pd.DataFrame") -> None:
 def analyze(
     folders: options.SearchFolders = None,
     storage: Storage = None,
-    study: options.StudyNames = None,
     pattern: options.Patterns = None,
-    ties_without: options.Ties = False,
     top: options.Top = 10,
     csv: Annotated[Path | None, typer.Option(help="Folder to write every table to, as NAME-TABLE.csv.")] = None,
     json: Annotated[Path | None, typer.Option(help="File to write all tables to.")] = None,
@@ -87,8 +85,8 @@ def analyze(
     from search.results import analysis
 
     summaries = {
-        name: analysis.summary(found.get_trials(deepcopy=False), found.direction, patterns_by_name(pattern), ties_without, top)
-        for name, (found, _) in open_studies(folders, storage, study).items()
+        name: analysis.summary(found.get_trials(deepcopy=False), found.direction, patterns_by_name(pattern), top)
+        for name, (found, _) in open_studies(folders, storage).items()
     }
     if csv is not None:
         csv.mkdir(parents=True, exist_ok=True)
@@ -132,7 +130,6 @@ def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
 def report(
     folder: options.SearchFolder = None,
     storage: Storage = None,
-    study: options.StudyName = None,
     benchmark: Annotated[Path | None, typer.Option(help="Folder of a benchmark whose tables and curves it shows too.")] = None,
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
@@ -140,7 +137,7 @@ def report(
     from search.results.report import stored_baselines, stored_runs, write_report
     from search.training.provenance import provenance
 
-    ((searched, path),) = open_studies([folder], storage, [study]).values()
+    ((searched, path),) = open_studies([folder], storage).values()
     out = out or path / "report.html"
     runs = stored_runs(path / "cross-validation")
     write_report(searched, out, stored_baselines(path), None, provenance(), runs, benchmark)

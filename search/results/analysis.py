@@ -42,16 +42,22 @@ COUNTS = tuple(f"{name}, n_target > n_source" for name in ("State", "Action", "R
 # are integers.
 FORMATS = {
     **dict.fromkeys(("difference", "gain"), "+.2f"),
-    **dict.fromkeys(("welch_p", "student_p"), ".2g"),
     **dict.fromkeys(("score", "mean", "std", "median", "mean_with", "mean_without", "spearman", "kendall"), ".2f"),
     **dict.fromkeys(("hours", "core_hours"), ".2f"),
-    **{"importance": ".3f", "distinct": ".0%", "hamming": ".1f", "average": ".2f", "lowest": ".2f", "highest": ".2f"},
+    **{
+        "welch_p": ".2g",
+        "importance": ".3f",
+        "distinct": ".0%",
+        "hamming": ".1f",
+        "average": ".2f",
+        "lowest": ".2f",
+        "highest": ".2f",
+    },
 }
 HEADINGS = {
     **{"n": "Losses", "std": "Deviation", "hamming": "Hamming distance", "index": "", "number": "Trial"},
-    **{"device": "Trained on", "average": "Mean"},
+    **{"device": "Trained on", "average": "Mean", "welch_p": "Welch p"},
     **{name: f"n {name[2:]}" for name in ("n_with", "n_without", "n_neither")},
-    **{"welch_p": "Welch p", "student_p": "Student p"},
 }
 COLUMNS: dict[str, Any] = {
     **{"number": int, "state": str, "generation": int, "operation": str, "parents": object, "score": float},
@@ -128,19 +134,15 @@ def has_pattern(loss: AuxLoss, pattern: AuxLoss) -> bool:
     return all(set(few) <= set(many) for few, many in sides)
 
 
-def table5_classes(
-    table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS, ties_without: bool = False
-) -> pd.DataFrame:
+def table5_classes(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS) -> pd.DataFrame:
     """
     The class of every analysed trial in each column of table 5.
 
     Section 3.3 compares losses with n_target > n_source to "the other way around", which it writes n_target < n_source. So
-    a loss with n_target = n_source is in neither class. The table itself only says "n_target > n_source":
-    ``ties_without=True`` counts these losses to the class without.
+    a loss with n_target = n_source is in neither class.
 
     :param table: As returned by :func:`trial_table`
     :param patterns: Name and pattern of each column: an AuxLoss, its notation, or its name in the catalogue
-    :param ties_without: Whether n_target = n_source counts as not n_target > n_source
     :return: One row an analysed trial, one column a pattern, then ``COUNTS``; True, False, or NA for neither
     :raises ValueError: for a pattern that cannot be read
     """
@@ -151,11 +153,11 @@ def table5_classes(
         columns[name] = [has_pattern(loss, pattern) for loss in losses]
     for i, name in enumerate(COUNTS):
         surplus = [sum(loss.target[i::3]) - sum(loss.source[i::3]) for loss in losses]
-        columns[name] = [None if n == 0 and not ties_without else n > 0 for n in surplus]
+        columns[name] = [None if n == 0 else n > 0 for n in surplus]
     return pd.DataFrame(columns, index=losses.index, dtype="boolean")
 
 
-def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS, ties_without: bool = False) -> pd.DataFrame:
+def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS) -> pd.DataFrame:
     """
     Whether losses with a pattern score otherwise than those without it (paper, section 3.3, table 5).
 
@@ -165,21 +167,20 @@ def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS
 
     :param table: As returned by :func:`trial_table`
     :param patterns: As in :func:`table5_classes`
-    :param ties_without: As in :func:`table5_classes`
-    :return: One row a pattern, then ``COUNTS``: ``difference`` of the mean scores (with - without), ``welch_p`` and
-        ``student_p`` of the two-sided t-tests without and with equal variances (NaN where a class is too small),
-        ``mean_with``, ``mean_without``, ``n_with``, ``n_without``, ``n_neither``
+    :return: One row a pattern, then ``COUNTS``: ``difference`` of the mean scores (with - without), ``welch_p`` of Welch's
+        two-sided t-test (NaN where a class is too small), ``mean_with``, ``mean_without``, ``n_with``, ``n_without``,
+        ``n_neither``
     :raises ValueError: for a pattern that cannot be read
     """
     scores = analysed(table)["score"]
-    classes = table5_classes(table, patterns, ties_without)
+    classes = table5_classes(table, patterns)
     rows = {}
     for name in classes:
         column = classes[name]
         comparison = _compare(scores[column.fillna(False)], scores[~column.fillna(True)])
         rows[name] = {**comparison, "n_neither": int(column.isna().sum())}
     counts = ["n_with", "n_without", "n_neither"]
-    columns = ["difference", "welch_p", "student_p", "mean_with", "mean_without", *counts]
+    columns = ["difference", "welch_p", "mean_with", "mean_without", *counts]
     return pd.DataFrame.from_dict(rows, orient="index", columns=columns).astype(dict.fromkeys(counts, int))
 
 
@@ -187,11 +188,11 @@ def _compare(scores_with: pd.Series, scores_without: pd.Series) -> dict[str, flo
     with warnings.catch_warnings():
         # Classes that are too small or have equal scores: the counts stand beside the NaN.
         warnings.simplefilter("ignore", RuntimeWarning)
-        welch, student = (ttest_ind(scores_with, scores_without, equal_var=equal).pvalue for equal in (False, True))
+        welch = ttest_ind(scores_with, scores_without, equal_var=False).pvalue
     mean_with, mean_without = scores_with.mean(), scores_without.mean()
     means = {"difference": mean_with - mean_without, "mean_with": mean_with, "mean_without": mean_without}
     counts = {"n_with": len(scores_with), "n_without": len(scores_without)}
-    return {**means, **counts, "welch_p": float(welch), "student_p": float(student)}
+    return {**means, **counts, "welch_p": float(welch)}
 
 
 def table5_layout(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
@@ -219,14 +220,14 @@ def effects(table: pd.DataFrame, by: str | Sequence[str]) -> pd.DataFrame:
     :param table: As returned by :func:`trial_table`
     :param by: One column of the table, or several
     :return: One row a group: ``n``, ``mean``, ``std``, ``median``, ``difference`` of its mean to that of all others, and
-        ``welch_p``, ``student_p`` as in :func:`table5`
+        ``welch_p`` as in :func:`table5`
     """
     trials = analysed(table)
     groups = trials.groupby(by if isinstance(by, str) else list(by))["score"]
     result = groups.agg(n="size", mean="mean", std="std", median="median")
     group = groups.ngroup()
     tests = [_compare(trials["score"][group == i], trials["score"][group != i]) for i in range(len(result))]
-    return result.join(pd.DataFrame(tests, index=result.index, columns=["difference", "welch_p", "student_p"], dtype=float))
+    return result.join(pd.DataFrame(tests, index=result.index, columns=["difference", "welch_p"], dtype=float))
 
 
 def importances(table: pd.DataFrame) -> pd.DataFrame:
@@ -340,7 +341,6 @@ def summary(
     trials: Sequence[FrozenTrial],
     direction: StudyDirection = StudyDirection.MAXIMIZE,
     patterns: Mapping[str, str | AuxLoss] = PATTERNS,
-    ties_without: bool = False,
     top: int = 10,
 ) -> Summary:
     """
@@ -349,7 +349,6 @@ def summary(
     :param trials: All trials of the study, in the order of numbers
     :param direction: The study's
     :param patterns: As in :func:`table5_classes`
-    :param ties_without: As in :func:`table5_classes`
     :param top: As in :func:`rank_agreement`
     :raises ValueError: for a pattern that cannot be read
     """
@@ -357,7 +356,7 @@ def summary(
     operator = ["operator", "negatives"]
     tables = {
         "population": population(table).to_frame().rename_axis("state"),
-        "table5": table5(table, patterns, ties_without).rename_axis("pattern"),
+        "table5": table5(table, patterns).rename_axis("pattern"),
         "horizon": effects(table, "horizon"),
         "operation": effects(table, "operation"),
         "diversity": diversity(table),

@@ -176,19 +176,18 @@ def evolution_plot(
     return figure
 
 
-def histogram_plot(tables: Mapping[str, pd.DataFrame], bins: int = 25) -> Figure:
+def histogram_plot(tables: Mapping[str, pd.DataFrame]) -> Figure:
     """
     How the scores of two or three studies are distributed: the paper's figure 7, evolution with and without pruning of
     the search space.
 
     :param tables: Name and trials of each study, as returned by ``analysis.trial_table``
-    :param bins: Number of bins over all scores
     :raises ValueError: for more than three studies
     """
     if len(tables) > len(HISTOGRAMS):
         raise ValueError(f"a histogram shows at most {len(HISTOGRAMS)} studies, not {len(tables)}: {', '.join(tables)}")
     figure, (axes,) = _panels([""], columns=1, width=6.4, height=3.8)
-    _histograms(axes, {name: analysis.analysed(table)["score"] for name, table in tables.items()}, bins)
+    _histograms(axes, {name: analysis.analysed(table)["score"] for name, table in tables.items()}, 25)
     axes.set_title(_counts_each(tables), fontsize=9)
     axes.set_xlabel(SCORE)
     axes.set_ylabel("Share of the candidates (%)")
@@ -199,8 +198,6 @@ def histogram_plot(tables: Mapping[str, pd.DataFrame], bins: int = 25) -> Figure
 def patterns_plot(
     tables: Mapping[str, pd.DataFrame],
     patterns: Mapping[str, str | AuxLoss] = analysis.PATTERNS,
-    ties_without: bool = False,
-    bins: int = 15,
 ) -> Figure:
     """
     Scores of the candidates with and without each pattern of table 5: the paper's figure 11. One column of panels a study;
@@ -210,8 +207,6 @@ def patterns_plot(
 
     :param tables: Title and trials of each study, as returned by ``analysis.trial_table``
     :param patterns: As in ``analysis.table5``
-    :param ties_without: As in ``analysis.table5``
-    :param bins: Number of bins over all scores of a study
     :raises ValueError: for a pattern that cannot be read
     """
     names = [*patterns, *analysis.COUNTS]
@@ -221,8 +216,8 @@ def patterns_plot(
     figure, panels = _panels(titles, figure_columns, width=3.1, height=2.3)
     for column, table in enumerate(tables.values()):
         scores = analysis.analysed(table)["score"]
-        classes = analysis.table5_classes(table, patterns, ties_without)
-        edges = np.histogram_bin_edges(scores, bins).tolist()
+        classes = analysis.table5_classes(table, patterns)
+        edges = np.histogram_bin_edges(scores, 15).tolist()
         for row, name in enumerate(names):
             axes = panels[row * len(tables) + column]
             groups = {"without": scores[~classes[name].fillna(True)], "with": scores[classes[name].fillna(False)]}
