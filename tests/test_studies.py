@@ -115,7 +115,7 @@ def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None
 def test_shown_settings_are_plain(config: SearchConfig) -> None:
     shown = settings(config)
     assert json.loads(json.dumps(shown)) == shown
-    assert shown["population_size"] == 4 and shown["batch_size"] == 8 and shown["environment"] == "Pendulum-v1"
+    assert shown["population_size"] == 3 and shown["batch_size"] == 8 and shown["environment"] == "Pendulum-v1"
 
 
 def test_pruners(config: SearchConfig) -> None:

@@ -26,9 +26,9 @@ hyperparameters: hyperparameters.yml
 checkpoints: [200, 400]
 evaluation_episodes: 1
 generations: 2
-n_random: 3
+n_random: 2
 n_prior: 1
-population_size: 4
+population_size: 3
 parents: 0.5
 max_horizon: 3
 seed: 3
