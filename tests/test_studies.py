@@ -73,7 +73,7 @@ def test_a_search_is_opened_again(config: SearchConfig, tmp_path: Path) -> None:
         ({"seeds": (1,)}, r"seeds=\[0\], not \[1\]"),
         ({"threads": 2}, "threads=1, not 2"),
         ({"overrides": {"batch_size": 16}}, "batch_size=8, not 16"),
-        ({"population_size": 6}, "population_size=4, not 6"),
+        ({"population_size": 6}, "population_size=3, not 6"),
         ({"initial": (LOSSES[1],)}, r"initial=\[\], not \['{s_t, a_t} -> {r_t}'\]"),
         ({"seed": 4}, "seed=3, not 4"),
     ],
