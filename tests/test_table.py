@@ -129,11 +129,11 @@ def plant(folder: Path, cell: Cell, curve: Mapping[int, float], checkpoints: Seq
 
 def printed(folder: Path, number: int | None = None) -> str:
     """All that is shown of a benchmark, in one line with single spaces."""
-    number, runs, comparison, iqm, better = table.read_tables(folder, number)
+    found = table.read_tables(folder, number)
     console = Console(width=1000, record=True, file=io.StringIO())
-    for shown in [*table.score_tables(comparison), *table.statistics_tables(iqm, better)]:
+    for shown in table.terminal_tables(found):
         console.print(shown)
-    lines = [*table.footnotes(number, comparison, iqm, better), *table.missing(runs), *table.mixed(runs)]
+    lines = [*table.footnotes(found), *table.missing(found.runs), *table.mixed(found.runs)]
     return " ".join([*console.export_text().split(), *lines])
 
 
@@ -401,7 +401,8 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
     for seed in (5, 6):
         plant(tmp_path, Cell("aarl_state", CHEETAH, seed), {}, steps, sessions=[])
     plant(tmp_path, Cell("mine", CHEETAH, 0), {}, steps, sessions=[{"commit": "c0ffee"}, {"commit": "beef"}])
-    number, runs, comparison, iqm, better = table.read_tables(tmp_path)
+    found = table.read_tables(tmp_path)
+    _, runs, comparison, iqm, _ = found
     row = comparison.set_index(["checkpoint", "variant"]).loc[(100_000, "aarl_state")]
     assert (row["planned"], row["runs"], row["mean"]) == (7, 4, np.mean([470, 471, 472, 480]))
     lines = table.missing(runs)
@@ -414,7 +415,7 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
         "Missing at 500,000: aarl_state on cheetah-run, seeds 5, 6: not started",
         "Missing at 500,000: mine on cheetah-run, seed 0: unfinished, evaluated up to 0",
     ]
-    assert table.as_data(number, comparison, iqm, better, runs)["missing"] == lines
+    assert table.as_data(found)["missing"] == lines
     early = iqm.set_index(["checkpoint", "variant"]).loc[100_000]
     assert list(early.index) == ["aarl_state", "sac_identity"]  # a variant without any run hides no others
     assert tuple(early.loc["aarl_state", ["planned", "runs"]]) == (7, 4)
@@ -433,7 +434,8 @@ def test_two_copies_of_a_run_are_refused(tmp_path: Path) -> None:
 def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) -> None:
     ours = {("aarl_state", CHEETAH): np.array([430.0, 440.0]), ("curl_state", CHEETAH): np.array([189.0, 191.0])}
     plant_scores(tmp_path, ours)
-    number, runs, comparison, iqm, better = table.read_tables(tmp_path)
+    found = table.read_tables(tmp_path)
+    _, runs, comparison, iqm, better = found
     own = [
         f"{scores.mean():.0f} ± {scores.std(ddof=1):.0f}"
         for scores in (matrix[:, 2] for matrix in planted_matrices().values())
@@ -441,7 +443,7 @@ def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) 
     shown = printed(tmp_path)
     assert f"│ cheetah-run │ 435 ± 7 ▼ │ 472 ± 30 │ 190 ± 1 │ 190 ± 32 │ {own[0]} │ {own[1]} │" in shown
     assert shown.index("AARL-State") < shown.index("CURL") and "Paper: table 4." in shown
-    data = json.loads(json.dumps(table.as_data(number, comparison, iqm, better, runs)))
+    data = json.loads(json.dumps(table.as_data(found)))
     assert data["table"] == 4 and data["missing"] == []
     frames = {"scores": comparison, "improvements": better, "interquartile_means": iqm, "runs": runs}
     for name, frame in frames.items():

@@ -52,16 +52,16 @@ def show_benchmark(folder: Path, number: int | None = None, csv: Path | None = N
     """Show the tables of a benchmark, and write them to files."""
     from search.results import table as tables
 
-    number, runs, comparison, iqm, better = tables.read_tables(folder, number)
+    found = tables.read_tables(folder, number)
     if csv is not None:
-        comparison.to_csv(csv, index=False)
+        found.comparison.to_csv(csv, index=False)
     if json is not None:
-        json.write_text(dumps(tables.as_data(number, comparison, iqm, better, runs), indent=1) + "\n", encoding="utf-8")
-    for shown in [*tables.score_tables(comparison), *tables.statistics_tables(iqm, better)]:
+        json.write_text(dumps(tables.as_data(found), indent=1) + "\n", encoding="utf-8")
+    for shown in tables.terminal_tables(found):
         print_wide(shown)
-    for line in tables.footnotes(number, comparison, iqm, better):
+    for line in tables.footnotes(found):
         console.print(line, highlight=False)
-    say_missing(runs)
+    say_missing(found.runs)
 
 
 def say_missing(runs: "pd.DataFrame") -> None:
@@ -135,12 +135,10 @@ def report(
 ) -> None:
     """Write a report of a search as one HTML file."""
     from search.results.report import stored_baselines, stored_runs, write_report
-    from search.training.provenance import provenance
 
     ((searched, path),) = open_studies([folder], storage).values()
     out = out or path / "report.html"
-    runs = stored_runs(path / "cross-validation")
-    write_report(searched, out, stored_baselines(path), None, provenance(), runs, benchmark)
+    write_report(searched, out, stored_baselines(path), stored_runs(path / "cross-validation"), benchmark)
     say(f"Report: {out}")
 
 

@@ -3,7 +3,7 @@
 import io
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from search.results.trials import lineage, ranked
 from search.studies import cross_validation
 from search.studies.benchmark import read_curves
 from search.studies.search import SETTINGS_KEY
-from search.training.provenance import ABOUT, read_about
+from search.training.provenance import ABOUT, provenance, read_about
 from search.training.run import is_finished
 
 N_BEST = 10
@@ -39,10 +39,8 @@ N_IMPORTANCES = 12
 
 def stored_runs(folder: Path) -> pd.DataFrame:
     """
-    The finished runs of a matrix, such as the baselines or the cross-validation of a search, read without its configuration:
-    one row each, as returned by :func:`search.execution.matrix.scores`; none if the folder is not there.
-
-    :param folder: Folder of the matrix
+    The finished runs of a matrix, such as the baselines or the cross-validation of a search, read from its folder without
+    its configuration: one row each, as returned by :func:`search.execution.matrix.scores`; none if the folder is not there.
     """
     rows = []
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{ABOUT}")):
@@ -53,11 +51,7 @@ def stored_runs(folder: Path) -> pd.DataFrame:
 
 
 def stored_baselines(folder: Path) -> list[tuple[str, float]]:
-    """
-    Name and mean score of the baselines of a search that have finished runs.
-
-    :param folder: Folder of the search; they are in its folder ``baselines``
-    """
+    """Name and mean score of the baselines that have finished runs, from the folder of a search."""
     means = stored_runs(folder / "baselines").groupby("variant")["score"].mean()
     return [(str(name), float(score)) for name, score in means.items()]
 
@@ -81,8 +75,6 @@ def write_report(
     study: Study,
     path: str | Path,
     baselines: Iterable[tuple[str, float]] = (),
-    settings: Mapping[str, Any] | None = None,
-    provenance: Mapping[str, Any] | None = None,
     validation: pd.DataFrame | None = None,
     benchmark: Path | None = None,
 ) -> None:
@@ -92,8 +84,6 @@ def write_report(
     :param study: The study
     :param path: Where the HTML file goes; its folder is made if it is not there
     :param baselines: Names and scores to compare with
-    :param settings: Names and values of the search's settings; None for those stored with the study
-    :param provenance: Of the report, as returned by ``search.training.provenance.provenance``
     :param validation: Runs of the cross-validation, as returned by :func:`stored_runs`
     :param benchmark: Folder of a benchmark whose tables and learning curves are shown too
     :raises ValueError: when there is no benchmark in the folder
@@ -102,7 +92,6 @@ def write_report(
     table = analysis.trial_table(trials)
     best = ranked(trials, study.direction)
     baselines = list(baselines)
-    settings = study.user_attrs.get(SETTINGS_KEY, {}) if settings is None else settings
     curves = learning_curves_figure(best[:N_CURVES])
     plots = [evolution_figure(table, baselines, study.direction)] if best else []
     machines = analysis.machines(trials)
@@ -113,7 +102,7 @@ def write_report(
     )
     html = environment.get_template("report.html").render(
         study=study,
-        settings=dict(settings),
+        settings=study.user_attrs.get(SETTINGS_KEY, {}),
         counts=Counter(table["state"]),
         hours=machines["hours"].sum(),
         generations=analysis.readable("generations", generation_table(table)),
@@ -129,7 +118,7 @@ def write_report(
         started=min(started, default=""),
         ended=max(ended, default=""),
         versions=Counter(trial.user_attrs["versions"] for trial in trials if "versions" in trial.user_attrs),
-        provenance=dict(provenance or {}),
+        provenance=provenance(),
     )
     replace_text(Path(path), html)
 
@@ -178,13 +167,12 @@ def _taught(study: Study, table: pd.DataFrame) -> dict[str, Any] | None:
 
 def _benchmark(folder: Path) -> dict[str, Any]:
     """The tables of a benchmark and its learning curves."""
-    number, runs, comparison, iqm, better = tables.read_tables(folder)
-    found = [*tables.score_tables(comparison), *tables.statistics_tables(iqm, better)]
+    found = tables.read_tables(folder)
     return {
         "folder": folder,
-        "tables": [(str(table.title), _frame(table)) for table in found],
-        "footnotes": tables.footnotes(number, comparison, iqm, better),
-        "missing": tables.missing(runs) + tables.mixed(runs),
+        "tables": [(str(table.title), _frame(table)) for table in tables.terminal_tables(found)],
+        "footnotes": tables.footnotes(found),
+        "missing": tables.missing(found.runs) + tables.mixed(found.runs),
         "curves": _picture(learning_curves_plot(read_curves(folder))),
     }
 

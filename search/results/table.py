@@ -62,11 +62,7 @@ def _paper_variant(variant: str) -> str:
 
 
 def closest_table(variants: Iterable[str]) -> int | None:
-    """
-    The paper's table with the most of some variants, None if none has any.
-
-    :param variants: Names of variants
-    """
+    """The paper's table with the most of some variants, None if none has any."""
     names = set(map(_paper_variant, variants))
     matches = {number: len(names & set(table["columns"].values())) for number, table in _paper().items()}
     best = max(matches, key=lambda number: matches[number])
@@ -110,12 +106,7 @@ def _why_missing(path: Path, about: dict[str, Any], checkpoint: int, returns: di
 
 
 def in_order(runs: pd.DataFrame, number: int | None) -> pd.DataFrame:
-    """
-    The runs in the order of a table of the paper, its tasks and variants before others.
-
-    :param runs: As returned by :func:`read_runs`
-    :param number: 3, 4 or 6, None for alphabetical order
-    """
+    """The runs in the order of a table of the paper, its tasks and variants before others; None for alphabetical order."""
     positions = {}
     for key in ("environment", "variant"):
         paper = [name + suffix for name in paper_scores(number)[key].dropna() for suffix in ("", BF16)]
@@ -192,11 +183,7 @@ def _normalized(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def missing(runs: pd.DataFrame) -> list[str]:
-    """
-    What is planned and not there, one line for each reason.
-
-    :param runs: As returned by :func:`read_runs`
-    """
+    """What is planned and not there, one line for each reason."""
     lines = []
     keys = ["checkpoint", "variant", "environment", "reason"]
     ordered = runs[runs["reason"] != ""].sort_values([*keys[:3], "seed"])
@@ -208,12 +195,7 @@ def missing(runs: pd.DataFrame) -> list[str]:
 
 
 def mixed(runs: pd.DataFrame) -> list[str]:
-    """
-    A line for each of these that differs between the runs, with the number of runs: commits, versions of packages, programs
-    that trained them, and episodes of an evaluation.
-
-    :param runs: As returned by :func:`read_runs`
-    """
+    """A line for each setting in which runs differ that should not be compared then, with the number of runs."""
     names = {"commit": "commits", "versions": "versions", "program": "programs", "episodes": "numbers of episodes"}
     runs = runs.drop_duplicates(["variant", "environment", "seed"])
     lines = []
@@ -226,15 +208,7 @@ def mixed(runs: pd.DataFrame) -> list[str]:
 
 
 class Tables(NamedTuple):
-    """
-    All that is shown of a benchmark.
-
-    :param number: The table of the paper beside it, None for none
-    :param runs: Its runs in that table's order
-    :param comparison: As returned by :func:`compare`
-    :param iqm: As returned by :func:`interquartile_means`
-    :param better: As returned by :func:`improvements`
-    """
+    """All that is shown of a benchmark: as returned by the functions above, and the number of the paper's table."""
 
     number: int | None
     runs: pd.DataFrame
@@ -257,12 +231,13 @@ def read_tables(folder: Path, number: int | None = None) -> Tables:
     return Tables(number, runs, compare(runs, number), interquartile_means(runs), improvements(runs))
 
 
-def score_tables(comparison: pd.DataFrame) -> list[Table]:
-    """
-    The layout of the paper: for each checkpoint tasks as rows, variants as columns, the paper's score beside each.
+def terminal_tables(tables: Tables) -> list[Table]:
+    """The scores in the layout of the paper, then the statistics over tasks, for each checkpoint."""
+    return [*_score_tables(tables.comparison), *_statistics_tables(tables.iqm, tables.better)]
 
-    :param comparison: As returned by :func:`compare`
-    """
+
+def _score_tables(comparison: pd.DataFrame) -> list[Table]:
+    """For each checkpoint tasks as rows, variants as columns, the paper's score beside each."""
     tables = []
     for checkpoint, part in comparison.groupby("checkpoint"):
         problem = "" if _is_comparable(part) else ", without the paper's: normalized by other variants than its four"
@@ -286,13 +261,7 @@ def score_tables(comparison: pd.DataFrame) -> list[Table]:
     return tables
 
 
-def statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
-    """
-    The statistics over tasks.
-
-    :param iqm: As returned by :func:`interquartile_means`
-    :param better: As returned by :func:`improvements`
-    """
+def _statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
     tables = []
     for checkpoint, part in iqm.groupby("checkpoint"):
         table = Table("", "variant", "IQM", "95 % interval", "runs", title=f"Interquartile means at {_steps(checkpoint)}")
@@ -316,15 +285,9 @@ def statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
     return tables
 
 
-def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, better: pd.DataFrame) -> list[str]:
-    """
-    How to read :func:`score_tables` and :func:`statistics_tables`, as far as something in them has to be explained.
-
-    :param number: Table of the paper
-    :param comparison: As returned by :func:`compare`
-    :param iqm: As returned by :func:`interquartile_means`
-    :param better: As returned by :func:`improvements`
-    """
+def footnotes(tables: Tables) -> list[str]:
+    """How to read :func:`terminal_tables`, as far as something in them has to be explained."""
+    number, _, comparison, iqm, better = tables
     lines = []
     if (iqm["runs"] < 4).any():
         lines.append(
@@ -339,9 +302,8 @@ def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, b
         lines.append("Each probability is over the tasks that both variants have runs on, which are not the same for all.")
     if (better["probability"].isin([0, 1]) & (better["low"] == better["high"])).any():
         lines.append(
-            "An interval without width means only that no run of one variant is better than any of the other: resampled runs "
-            "cannot show more. Two equal variants look like that with a probability of 1/3 (two runs each on one task), 1/10 "
-            "(three) or 1/126 (five)."
+            "An interval without width means only that no run of one variant is better than any of the other: two equal "
+            "variants look like that with a probability of 1/3 (two runs each on one task), 1/10 (three) or 1/126 (five)."
         )
     if comparison["paper_mean"].notna().any():
         lines.append(
@@ -351,16 +313,9 @@ def footnotes(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, b
     return lines
 
 
-def as_data(number: int | None, comparison: pd.DataFrame, iqm: pd.DataFrame, better: pd.DataFrame, runs: pd.DataFrame) -> dict:
-    """
-    All that is shown, in plain values for JSON.
-
-    :param number: Table of the paper
-    :param comparison: As returned by :func:`compare`
-    :param iqm: As returned by :func:`interquartile_means`
-    :param better: As returned by :func:`improvements`
-    :param runs: As returned by :func:`read_runs`
-    """
+def as_data(tables: Tables) -> dict[str, Any]:
+    """All that is shown, in plain values for JSON."""
+    number, runs, comparison, iqm, better = tables
     frames = {"scores": comparison, "interquartile_means": iqm, "improvements": better, "runs": runs}
     records = {name: json.loads(frame.to_json(orient="records", double_precision=15)) for name, frame in frames.items()}
     return {"table": number, **records, "missing": missing(runs)}
