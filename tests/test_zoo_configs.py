@@ -18,7 +18,7 @@ from sb3_aarl.envs import env_ids, make_dmc_env
 from search.training.config import load_hyperparameters, merge
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
-FILES = sorted([*ZOO.glob("*.yml"), *(ZOO / "choices").glob("*.yml")])
+FILES = sorted(path for folder in (ZOO, ZOO / "choices", ZOO / "body") for path in folder.glob("*.yml"))
 
 # Table 4: 100K steps above, 1000K below.
 EASY = (
@@ -193,6 +193,25 @@ def test_choices_differ_in_nothing_else() -> None:
         path = ZOO / "choices" / f"{choice}.yml"
         for env_id in {*yaml.safe_load(path.read_text()), "dm_control/walker-walk-v0"} - {"default"}:
             assert load_hyperparameters(path, env_id) == merge(load_hyperparameters(ZOO / f"{variant}.yml", env_id), changes)
+
+
+def test_bodies_differ_in_nothing_else() -> None:
+    for name, loss, encoder in (
+        ("simba", {}, {"features_extractor_class": "simba"}),
+        ("simba_no_aux", {"aux_loss": None}, {"features_extractor_class": "simba"}),
+        ("dense_mlp", {}, {}),
+    ):
+        path = ZOO / "body" / f"{name}.yml"
+        for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
+            small = merge(load_hyperparameters(ZOO / "aarl_state.yml", "dm_control/hopper-stand-v0"), SMALL)
+            wanted = {**small, **loss, "learning_rate": 3e-4, "policy_kwargs": {**small["policy_kwargs"], **encoder}}
+            if encoder:
+                del wanted["policy_kwargs"]["features_extractor_kwargs"]
+            if loss:
+                wanted = {key: value for key, value in wanted.items() if key not in ("encoder_tau", "predictor_width")}
+            if env_id.startswith(("dm_control/walker", "dm_control/finger")):
+                wanted |= {"n_timesteps": 50_000, "env_kwargs": {"action_repeat": 2}}
+            assert load_hyperparameters(path, env_id) == wanted
 
 
 @functools.cache
