@@ -15,10 +15,10 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from sb3_aarl.aux_loss import AuxLoss
 from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import loss_to_params, suggest_aux_loss
+from search.evolution.space import loss_of, loss_to_params, suggest_aux_loss
 from search.execution.storage import open_storage
 from search.results import dashboard
-from search.results.trials import lineage, loss_of
+from search.results.trials import lineage
 
 EVIL = "<script>document.title='owned'</script> ![x](https://example.org/x.png) **bold** | `code`\n# www.example.org"
 BASELINES = [("SAC", 90.0), ("CURL", 110.0)]

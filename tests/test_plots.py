@@ -16,7 +16,7 @@ from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution.space import distributions, loss_to_params, random_loss
+from search.evolution.space import distributions, loss_of, loss_to_params, random_loss
 from search.results import analysis
 from search.results.plots import (
     evolution_figure,
@@ -27,7 +27,7 @@ from search.results.plots import (
     patterns_plot,
     rankings_plot,
 )
-from search.results.trials import lineage, loss_of, ranked, seconds_of
+from search.results.trials import lineage, ranked, seconds_of
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 BASELINES = [("SAC", 12.5), ("<b>CURL</b>", -3.0)]

@@ -14,19 +14,9 @@ from sklearn.ensemble import RandomForestRegressor
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution.space import loss_to_params
+from search.evolution.space import loss_of, loss_to_params
 from search.results.rankings import rank_agreement, rankings
-from search.results.trials import (
-    curve_of,
-    generation_of,
-    lineage,
-    loss_of,
-    operation_of,
-    parents_of,
-    ranked,
-    score_of,
-    seconds_of,
-)
+from search.results.trials import curve_of, lineage, ranked, score_of, seconds_of
 
 # Section 3.3, in the order of table 5.
 PATTERNS: Mapping[str, str | AuxLoss] = {
@@ -81,9 +71,10 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
         row = {
             "number": trial.number,
             "state": "interrupted" if trial.user_attrs.get("interrupted") else trial.state.name.lower(),
-            "generation": generation_of(trial),
-            "operation": operation_of(trial),
-            "parents": parents_of(trial),
+            # Other samplers than AuxLossSampler have one generation only.
+            "generation": trial.user_attrs.get("generation", 1),
+            "operation": trial.user_attrs.get("operation", "-"),
+            "parents": list(trial.user_attrs.get("parents", ())),
             "score": np.nan if score is None else score,
             "loss": loss,
             "canonical": None if loss is None else loss.canonical(),
@@ -97,19 +88,14 @@ def analysed(table: pd.DataFrame) -> pd.DataFrame:
     """
     The trials that can be compared: complete, with a finite score and a valid loss. The score of a pruned trial is that of
     a run which was stopped early; failed, running and waiting ones have none.
-
-    :param table: As returned by :func:`trial_table`
     """
     return table[(table["state"] == "complete") & table["score"].notna() & table["loss"].notna()]
 
 
 def population(table: pd.DataFrame) -> pd.Series:
     """
-    How many trials there are, how many of them are analysed, and what became of the others.
-
-    :param table: As returned by :func:`trial_table`
-    :return: ``trials``, ``analysed``, then trials by state: ``pruned``, ``fail``, ``interrupted``, ``running``, ``waiting``,
-        and ``unusable``: complete, but without a finite score or a valid loss. ``trials`` is the sum of the others
+    How many ``trials`` there are, how many of them are ``analysed``, and how many of the others are ``pruned``, ``fail``,
+    ``interrupted``, ``running``, ``waiting``, or ``unusable``: complete, but without a finite score or a valid loss.
     """
     states = table["state"].value_counts()
     n_analysed = len(analysed(table))
@@ -126,9 +112,6 @@ def has_pattern(loss: AuxLoss, pattern: AuxLoss) -> bool:
     The sets are those of tokens, offsets included, and nothing is shifted in time: ``{s_t+1, a_t+1} -> {s_t+2}`` does not
     have the pattern ``{s_t, a_t} -> {s_t+1}`` though its canonical form does. Neither operator matters. To compare the
     canonical forms instead, pass ``table.assign(loss=table["canonical"])`` to the functions below.
-
-    :param loss: The candidate
-    :param pattern: The pattern
     """
     sides = ((pattern.source_tokens, loss.source_tokens), (pattern.target_tokens, loss.target_tokens))
     return all(set(few) <= set(many) for few, many in sides)
@@ -136,14 +119,14 @@ def has_pattern(loss: AuxLoss, pattern: AuxLoss) -> bool:
 
 def table5_classes(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS) -> pd.DataFrame:
     """
-    The class of every analysed trial in each column of table 5.
+    The class of every analysed trial in each column of table 5: True, False, or NA for neither.
 
     Section 3.3 compares losses with n_target > n_source to "the other way around", which it writes n_target < n_source. So
     a loss with n_target = n_source is in neither class.
 
     :param table: As returned by :func:`trial_table`
     :param patterns: Name and pattern of each column: an AuxLoss, its notation, or its name in the catalogue
-    :return: One row an analysed trial, one column a pattern, then ``COUNTS``; True, False, or NA for neither
+    :return: One row an analysed trial, one column a pattern, then ``COUNTS``
     :raises ValueError: for a pattern that cannot be read
     """
     losses = analysed(table)["loss"]
@@ -170,7 +153,6 @@ def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS
     :return: One row a pattern, then ``COUNTS``: ``difference`` of the mean scores (with - without), ``welch_p`` of Welch's
         two-sided t-test (NaN where a class is too small), ``mean_with``, ``mean_without``, ``n_with``, ``n_without``,
         ``n_neither``
-    :raises ValueError: for a pattern that cannot be read
     """
     scores = analysed(table)["score"]
     classes = table5_classes(table, patterns)
@@ -198,10 +180,9 @@ def _compare(scores_with: pd.Series, scores_without: pd.Series) -> dict[str, flo
 def table5_layout(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """
     Table 5 as the paper prints it: one row a study, differences with * where Welch's p < 0.05 and ** where p < 0.01 (the
-    paper only says "t-test").
+    paper only says "t-test"), a dash where a class is empty.
 
     :param tables: Results of :func:`table5` by the names of the studies
-    :return: Strings; a dash where a class is empty
     """
 
     def cell(row: pd.Series) -> str:
@@ -217,8 +198,6 @@ def effects(table: pd.DataFrame, by: str | Sequence[str]) -> pd.DataFrame:
     Scores of the analysed trials of each group, and their differences from all others: ``by="horizon"``,
     ``by=["operator", "negatives"]``, ``by="operation"`` (the effect of the mutations), ``by="generation"``.
 
-    :param table: As returned by :func:`trial_table`
-    :param by: One column of the table, or several
     :return: One row a group: ``n``, ``mean``, ``std``, ``median``, ``difference`` of its mean to that of all others, and
         ``welch_p`` as in :func:`table5`
     """
@@ -237,7 +216,6 @@ def importances(table: pd.DataFrame) -> pd.DataFrame:
     A loss has no parameters for tokens beyond its horizon: such a token is not chosen. The horizon and, if they vary,
     operator and negatives are parameters too: what they explain is not attributed to the tokens.
 
-    :param table: As returned by :func:`trial_table`
     :return: One row a parameter (``source/s_t+1``, ``target/r_t``, ``horizon``, ...), the most important first:
         ``importance`` (they sum to 1), and for tokens ``difference`` (mean score with - without), ``n_with``, ``n_without``
     :raises ValueError: when there are no two different scores
@@ -265,7 +243,6 @@ def diversity(table: pd.DataFrame) -> pd.DataFrame:
     How different the losses of each generation are. Trials that are complete or pruned count: the slot of a failed one has
     another candidate, and one that runs may still fail.
 
-    :param table: As returned by :func:`trial_table`
     :return: One row a generation: ``n`` losses, ``distinct`` (share of different canonical forms, operators included), and
         ``hamming``: mean over all pairs of the number of bits in which the masks of their canonical forms differ, shorter ones
         filled up with zeros (NaN for fewer than two losses)
@@ -283,12 +260,11 @@ def diversity(table: pd.DataFrame) -> pd.DataFrame:
 
 def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
     """
-    The best trial and all its ancestors, the latest first.
+    The best trial and all its ancestors, the latest first; empty if no trial has a score.
 
     :param trials: All trials of the study, in the order of numbers
-    :param direction: The study's
     :return: By ``number``: ``generation``, ``operation``, ``parents``, ``score``, ``gain`` (the score less that of the best
-        parent, NaN without parents) and the notation of the ``loss``. Empty if no trial has a score
+        parent, NaN without parents) and the notation of the ``loss``
     """
     best = ranked(trials, direction)[:1]
     line = [*best, *(ancestor for trial in best for ancestor in lineage(trial, trials))]
@@ -304,7 +280,6 @@ def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
     Where the trials were trained, and how long it took.
 
-    :param trials: Trials of a study
     :return: One row a device and commit, as noted by the driver: finished ``trials``, failed ones included, but not those
         that were interrupted; their ``hours``, one run after the other; ``core_hours`` (hours x threads; NaN for GPUs and
         where nothing is noted)
@@ -324,14 +299,7 @@ def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
 
 
 class Summary(NamedTuple):
-    """
-    All that is known of a study's losses.
-
-    :param tables: ``population``, ``table5``, ``importances``, ``horizon`` and ``operation`` (their effects), ``operator``
-        (its effects, if it was searched), ``diversity``, ``lineage`` (of the best; losses as their notation),
-        ``machines`` and ``rank_agreement``, as returned by the functions above; without those that cannot be made
-    :param problems: Why a table cannot be made, by its name
-    """
+    """The tables of a study's losses by name, as returned by the functions above, and why one cannot be made, by its name."""
 
     tables: dict[str, pd.DataFrame]
     problems: dict[str, str]
@@ -344,13 +312,12 @@ def summary(
     top: int = 10,
 ) -> Summary:
     """
-    Everything above for one study.
+    Everything above for one study; ``operator`` only if it was searched, the losses of ``lineage`` as their notation.
 
     :param trials: All trials of the study, in the order of numbers
     :param direction: The study's
     :param patterns: As in :func:`table5_classes`
     :param top: As in :func:`rank_agreement`
-    :raises ValueError: for a pattern that cannot be read
     """
     table = trial_table(trials)
     operator = ["operator", "negatives"]
@@ -378,12 +345,7 @@ def summary(
 
 
 def readable(name: str, table: pd.DataFrame) -> pd.DataFrame:
-    """
-    A table of a summary as texts: a dash for missing values, * where Welch's p < 0.05 and ** where it is < 0.01.
-
-    :param name: Name of the table
-    :param table: The table
-    """
+    """A table of a summary as texts: a dash for missing values, * where Welch's p < 0.05 and ** where it is < 0.01."""
 
     def cell(column: Any, value: Any) -> str:
         if isinstance(value, list):

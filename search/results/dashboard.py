@@ -11,9 +11,10 @@ from optuna.trial import FrozenTrial
 from optuna_dashboard import save_note, save_plotly_graph_object
 
 from sb3_aarl.aux_loss import AuxLoss
+from search.evolution.space import loss_of
 from search.results.analysis import trial_table
 from search.results.plots import evolution_figure
-from search.results.trials import curve_of, generation_of, lineage, loss_of, operation_of, parents_of, score_of
+from search.results.trials import curve_of, lineage, score_of
 
 PLOT_ID = "evolution"
 # Notes are attributes of the study, of which every page of the dashboard reads all.
@@ -82,16 +83,17 @@ def _loss_lines(trial: FrozenTrial, loss: AuxLoss | None) -> list[str]:
 
 
 def _origin(trial: FrozenTrial) -> str:
-    parents = " and trial ".join(map(str, parents_of(trial)))
-    operation = _escape(operation_of(trial)) + (f" of trial {parents}" if parents else "")
-    return f"**Generation:** {generation_of(trial)}. **Operation:** {operation}."
+    attributes = trial.user_attrs
+    parents = " and trial ".join(map(str, attributes.get("parents", ())))
+    operation = _escape(attributes.get("operation", "-")) + (f" of trial {parents}" if parents else "")
+    return f"**Generation:** {attributes.get('generation', 1)}. **Operation:** {operation}."
 
 
 def _ancestor(trial: FrozenTrial) -> tuple[Any, ...]:
-    score, loss = score_of(trial), loss_of(trial)
-    origin = _escape(" ".join([operation_of(trial), *map(str, parents_of(trial))]))
+    score, loss, attributes = score_of(trial), loss_of(trial), trial.user_attrs
+    origin = _escape(" ".join([attributes.get("operation", "-"), *map(str, attributes.get("parents", ()))]))
     notation = f"`{textwrap.shorten(str(loss), 100, placeholder=' …')}`" if loss else "-"
-    return trial.number, generation_of(trial), origin, "-" if score is None else f"{score:.1f}", notation
+    return trial.number, attributes.get("generation", 1), origin, "-" if score is None else f"{score:.1f}", notation
 
 
 def _escape(text: object) -> str:

@@ -9,11 +9,7 @@ _TOKEN = re.compile(r"\b([sar])_t(?:\+(\d+))?")
 
 
 def mathml(loss: AuxLoss) -> str:
-    """
-    The loss as the paper prints it, for HTML: one ``math`` element a token, because browsers break no line inside of one.
-
-    :param loss: The loss
-    """
+    """The loss as the paper prints it, for HTML: one ``math`` element a token, as browsers break no line inside of one."""
 
     def token(match: re.Match[str]) -> str:
         offset = f"<mo>+</mo><mn>{match[2]}</mn>" if match[2] else ""

@@ -105,11 +105,7 @@ def _generation_lines(trials: pd.DataFrame, direction: StudyDirection) -> Iterat
 
 
 def learning_curves_figure(trials: Iterable[FrozenTrial]) -> go.Figure:
-    """
-    The learning curves of some trials, with standard deviations as bars; trials without a curve are skipped.
-
-    :param trials: Trials, in the order of the legend
-    """
+    """The learning curves of some trials, with standard deviations as bars; trials without a curve are skipped."""
     figure = go.Figure()
     for position, trial in enumerate(trial for trial in trials if curve_of(trial)):
         steps, means, deviations = map(list, zip(*curve_of(trial), strict=True))
@@ -178,11 +174,10 @@ def evolution_plot(
 
 def histogram_plot(tables: Mapping[str, pd.DataFrame]) -> Figure:
     """
-    How the scores of two or three studies are distributed: the paper's figure 7, evolution with and without pruning of
-    the search space.
+    How the scores of up to three studies are distributed: the paper's figure 7, evolution with and without pruning of the
+    search space.
 
     :param tables: Name and trials of each study, as returned by ``analysis.trial_table``
-    :raises ValueError: for more than three studies
     """
     if len(tables) > len(HISTOGRAMS):
         raise ValueError(f"a histogram shows at most {len(HISTOGRAMS)} studies, not {len(tables)}: {', '.join(tables)}")
@@ -201,13 +196,10 @@ def patterns_plot(
 ) -> Figure:
     """
     Scores of the candidates with and without each pattern of table 5: the paper's figure 11. One column of panels a study;
-    a single study's patterns stand beside each other.
-
-    Each class is a population of its own: its bars sum to 100 %.
+    a single study's patterns stand beside each other. Each class is a population of its own: its bars sum to 100 %.
 
     :param tables: Title and trials of each study, as returned by ``analysis.trial_table``
     :param patterns: As in ``analysis.table5``
-    :raises ValueError: for a pattern that cannot be read
     """
     names = [*patterns, *analysis.COUNTS]
     single = len(tables) == 1
@@ -238,7 +230,7 @@ def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
 
     :param table: Trials of a study, as returned by ``analysis.trial_table``
     :param top: Number of candidates in each panel
-    :raises ValueError: when no trial has a learning curve, or they have different checkpoints
+    :raises ValueError: as :func:`rankings` does
     """
     ranking = rankings(analysis.analysed(table))
     agreement = rank_agreement(ranking, top)

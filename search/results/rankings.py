@@ -59,11 +59,5 @@ def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
 
 
 def leading(ranking: pd.DataFrame, metric: str, top: int = 10) -> pd.DataFrame:
-    """
-    The best trials under one metric; of equals the ones with lower numbers.
-
-    :param ranking: As returned by :func:`rankings`
-    :param metric: ``aulc``, ``first`` or ``last``
-    :param top: How many
-    """
+    """The best trials under a metric (``aulc``, ``first`` or ``last``); of equals the ones with lower numbers."""
     return ranking.sort_values([f"rank_{metric}", "number"]).head(top)

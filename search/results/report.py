@@ -58,11 +58,8 @@ def stored_baselines(folder: Path) -> list[tuple[str, float]]:
 
 def generation_table(table: pd.DataFrame) -> pd.DataFrame:
     """
-    What became of the trials of every generation.
-
-    :param table: As returned by :func:`search.results.analysis.trial_table`
-    :return: One row a generation: trials by state, ``average``, ``lowest`` and ``highest`` score (NaN without any),
-        ``distinct`` and ``hamming`` as in :func:`search.results.analysis.diversity`
+    What became of the trials of every generation: trials by state, ``average``, ``lowest`` and ``highest`` score (NaN
+    without any), ``distinct`` and ``hamming`` as in :func:`search.results.analysis.diversity`.
     """
     # Other samplers than ours may propose what is no valid loss: it is pruned at once, and costs nothing.
     trials = table[(table["state"] != "pruned") | table["loss"].notna()]
@@ -86,7 +83,6 @@ def write_report(
     :param baselines: Names and scores to compare with
     :param validation: Runs of the cross-validation, as returned by :func:`stored_runs`
     :param benchmark: Folder of a benchmark whose tables and learning curves are shown too
-    :raises ValueError: when there is no benchmark in the folder
     """
     trials = study.get_trials(deepcopy=False)
     table = analysis.trial_table(trials)

@@ -19,7 +19,7 @@ CONFIDENCE = 0.95
 SUITE = "DeepMind Control"
 
 
-def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
+def interquartile_means(runs: pd.DataFrame) -> pd.DataFrame:
     """
     Interquartile mean (IQM) of the returns with a 95 % interval by stratified bootstrap (Agarwal et al. 2021, rliable):
     percentiles over resamples of the seeds within each task.
@@ -29,7 +29,6 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
     the seeds that it has on all of them, so that every task weighs the same; variants without any run are left out.
 
     :param runs: As returned by ``table.read_runs``
-    :param n_resamples: Resamples of the bootstrap
     :return: One row for each ``checkpoint``, ``tasks`` (name of the scale; of a single task its own) and ``variant``:
         ``n_tasks``, ``planned``, ``runs`` that count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has
         one run only), the runs ``left_out``, and names of the tasks ``skipped``
@@ -46,7 +45,7 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
             matrix = planned.pivot(index="environment", columns="seed", values="mean").dropna(axis="columns")
             samples = list(matrix.to_numpy())
             iqm = _iqm(*samples) if matrix.size else math.nan
-            interval = _interval(samples, _iqm, n_resamples)
+            interval = _interval(samples, _iqm)
             left_out = planned["mean"].count() - matrix.size
             counts = (len(common), len(planned), matrix.size)
             rows.append((checkpoint, tasks, variant, *counts, iqm, *interval, left_out, skipped))
@@ -54,13 +53,12 @@ def interquartile_means(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.
     return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
 
 
-def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFrame:
+def improvements(runs: pd.DataFrame) -> pd.DataFrame:
     """
     Probability that a run of one variant is better than one of another on the same task, a tie being half, as the mean over
     all tasks that both have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap.
 
     :param runs: As returned by ``table.read_runs``
-    :param n_resamples: Resamples of the bootstrap
     :return: One row for each ``checkpoint``, ``variant`` and ``over``: ``n_tasks``, ``probability``, ``low`` and ``high``
     """
     rows = []
@@ -70,7 +68,7 @@ def improvements(runs: pd.DataFrame, n_resamples: int = RESAMPLES) -> pd.DataFra
         for variant, over in permutations(part["variant"].unique(), 2):
             if common := sorted(tasks[variant] & tasks[over]):
                 samples = [returns[name, task] for name in (variant, over) for task in common]
-                interval = _interval(samples, _improvement, n_resamples)
+                interval = _interval(samples, _improvement)
                 rows.append((checkpoint, variant, over, len(common), _improvement(*samples), *interval))
     return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high"])
 
@@ -94,11 +92,11 @@ def _improvement(*samples: np.ndarray, axis: int = -1) -> Any:
     return np.mean(shares, axis=0)
 
 
-def _interval(samples: Sequence[np.ndarray], statistic: Any, n_resamples: int) -> tuple[float, float]:
+def _interval(samples: Sequence[np.ndarray], statistic: Any) -> tuple[float, float]:
     """rliable's own bootstrap needs an ``arch`` that pandas 3 breaks; scipy's, with a sample for each stratum, is the same."""
     if min(map(len, samples)) < 2:
         return math.nan, math.nan
     settings = {"vectorized": True, "method": "percentile", "confidence_level": CONFIDENCE, "batch": 1000}
     rng = np.random.default_rng(0)
-    interval = stats.bootstrap(samples, statistic, n_resamples=n_resamples, rng=rng, **settings).confidence_interval
+    interval = stats.bootstrap(samples, statistic, n_resamples=RESAMPLES, rng=rng, **settings).confidence_interval
     return float(interval.low), float(interval.high)

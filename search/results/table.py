@@ -39,11 +39,9 @@ def _paper() -> dict[int, dict[str, Any]]:
 
 def paper_scores(number: int | None) -> pd.DataFrame:
     """
-    A table of the paper: one row a score with ``checkpoint`` (environment steps), ``environment`` (its id), ``column`` (the
-    paper's heading), ``variant`` (the name in ``zoo_configs``, None for methods that are not here), ``mean``, ``std`` and
-    ``runs``.
-
-    :param number: 3, 4 or 6; None for an empty one
+    A table of the paper, empty for None: one row a score with ``checkpoint`` (environment steps), ``environment`` (its id),
+    ``column`` (the paper's heading), ``variant`` (the name in ``zoo_configs``, None for methods that are not here), ``mean``,
+    ``std`` and ``runs``.
     """
     rows = []
     for table in [] if number is None else [_paper()[number]]:
@@ -218,13 +216,7 @@ class Tables(NamedTuple):
 
 
 def read_tables(folder: Path, number: int | None = None) -> Tables:
-    """
-    All that is shown of a benchmark.
-
-    :param folder: Folder of a benchmark
-    :param number: Table of the paper, None for the one with most of the variants
-    :raises ValueError: as :func:`read_runs`
-    """
+    """All that is shown of a benchmark, beside a table of the paper: by default the one with most of the variants."""
     runs = read_runs(folder)
     number = closest_table(runs["variant"]) if number is None else number
     runs = in_order(runs, number)

@@ -7,26 +7,7 @@ from optuna import Trial
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from search.evolution.space import loss_of
-
-__all__ = ["curve_of", "generation_of", "lineage", "loss_of", "operation_of", "parents_of", "ranked", "score_of", "seconds_of"]
-
 Curve = list[tuple[int, float, float]]
-
-
-def generation_of(trial: FrozenTrial | Trial) -> int:
-    """The generation of a trial; other samplers than AuxLossSampler have one generation only."""
-    return trial.user_attrs.get("generation", 1)
-
-
-def operation_of(trial: FrozenTrial | Trial) -> str:
-    """What made the candidate, such as ``crossover``; ``-`` under other samplers."""
-    return trial.user_attrs.get("operation", "-")
-
-
-def parents_of(trial: FrozenTrial | Trial) -> list[int]:
-    """Numbers of the trials that a candidate descends from."""
-    return list(trial.user_attrs.get("parents", ()))
 
 
 def curve_of(trial: FrozenTrial | Trial) -> Curve:
@@ -53,29 +34,19 @@ def seconds_of(trial: FrozenTrial) -> float | None:
 
 
 def ranked(trials: Iterable[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> list[FrozenTrial]:
-    """
-    The trials that have a score, the best first.
-
-    :param trials: Trials of a study
-    :param direction: The study's
-    """
+    """The trials that have a score, the best first."""
     sign = -1 if direction == StudyDirection.MAXIMIZE else 1
     scores = [(score, trial) for trial in trials if (score := score_of(trial)) is not None]
     return [trial for _, trial in sorted(scores, key=lambda scored: (sign * scored[0], scored[1].number))]
 
 
 def lineage(trial: FrozenTrial | Trial, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-    """
-    All ancestors of a trial. The line through the first parent of each comes first, back to its end.
-
-    :param trial: The trial
-    :param trials: All trials of the study, in the order of numbers
-    """
+    """All ancestors of a trial. The line through the first parent of each comes first, back to its end."""
     ancestors: dict[int, FrozenTrial] = {}
-    stack = parents_of(trial)[::-1]
+    stack = list(reversed(trial.user_attrs.get("parents", ())))
     while stack:
         number = stack.pop()
         if number not in ancestors:
             ancestors[number] = trials[number]
-            stack.extend(parents_of(trials[number])[::-1])
+            stack.extend(reversed(trials[number].user_attrs.get("parents", ())))
     return list(ancestors.values())
