@@ -13,7 +13,7 @@ from sb3_aarl import catalog
 from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search.execution.matrix import Cell, Matrix, all_cells, task_name
-from search.training.config import ConfigError, action_repeat, load_hyperparameters, named_environments, resolve_env_id
+from search.training.config import ConfigError, action_repeat, load_hyperparameters, read_yaml, resolve_env_id
 from search.training.provenance import ABOUT, read_about
 from search.training.run import Run, check_run, checkpoint_interval
 
@@ -93,9 +93,8 @@ def load_benchmark(
 
 def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     """
-    The ``provenance.json`` of a benchmark's runs, by their folders.
+    The ``provenance.json`` of a benchmark's runs, by their folders, those copied from another machine too.
 
-    :param folder: Folder of a benchmark; runs that were copied there from another machine count too
     :raises ValueError: naming one that cannot be read, two folders that have the same run, or runs of a variant on an
         environment that were trained in different ways
     """
@@ -122,7 +121,6 @@ def read_curves(folder: Path) -> pd.DataFrame:
     The learning curves of a benchmark's runs: one row an evaluation with ``variant``, ``env`` (short form), ``seed``,
     ``environment_steps``, ``mean`` and ``std`` (of the episodes' returns). Runs without an evaluation are skipped.
 
-    :param folder: Folder of a benchmark
     :raises ValueError: when no run has a learning curve
     """
     rows = [
@@ -138,9 +136,8 @@ def read_curves(folder: Path) -> pd.DataFrame:
 
 def parse_steps(text: str) -> tuple[int, ...]:
     """
-    Read environment steps.
+    Environment steps, such as ``100k,500k,1M`` or ``20000``.
 
-    :param text: Such as ``100k,500k,1M`` or ``20000``
     :raises ValueError: naming what is no number of steps
     """
     steps = []
@@ -154,9 +151,8 @@ def parse_steps(text: str) -> tuple[int, ...]:
 
 def parse_seeds(text: str) -> tuple[int, ...]:
     """
-    Read seeds.
+    Seeds, such as ``0-9`` or ``0,3,5-7``.
 
-    :param text: Such as ``0-9`` or ``0,3,5-7``
     :raises ValueError: naming what is neither a number nor a range
     """
     seeds: list[int] = []
@@ -170,8 +166,8 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 def _common_environments(files: Iterable[Path]) -> list[str]:
     """The environments that all files name, in the order of the first."""
-    first, *others = [named_environments(path) for path in files]
-    common = [name for name in first if all(name in names for names in others)]
+    first, *others = map(read_yaml, files)
+    common = [name for name in first if name != "default" and all(name in names for names in others)]
     if not common:
         raise ConfigError("the files have no entry of one environment in common: name environments")
     return common

@@ -163,7 +163,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
         if isinstance(value, list | tuple):
             return tuple(loss for item in value for loss in cls._losses(item, info))
         if isinstance(value, str) and value.endswith((".yml", ".yaml")):
-            return cls._losses(training.read_yaml(info.data["path"].parent / value).get("aux_loss", []), info)
+            return (training.load_aux_loss(info.data["path"].parent / value),)
         if value == "published":
             losses = [candidate.loss for candidate in catalog.published()]
         elif value == "handcrafted":
@@ -185,21 +185,12 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
         return self.path.stem
 
     def hyperparameters_for(self, environment: str, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """
-        The hyper-parameters of a run.
-
-        :param environment: Id of the environment
-        :param overrides: Merged over them, such as those of a baseline
-        """
+        """The hyper-parameters of a run on an environment, with overrides such as those of a baseline merged over them."""
         merged = training.merge(training.load_hyperparameters(self.hyperparameters, environment), self.overrides)
         return training.check_hyperparameters(training.merge(merged, overrides or {}), environment, f"{self.path}: overrides")
 
     def checkpoints_for(self, environment: str) -> tuple[int, ...]:
-        """
-        The environment steps of the evaluations on an environment.
-
-        :param environment: Id of the environment
-        """
+        """The environment steps of the evaluations on an environment."""
         others = self.cross_validation.checkpoints if self.cross_validation else {}
         return self.checkpoints if environment == self.environment else others.get(environment, self.checkpoints)
 
@@ -217,9 +208,8 @@ def load_config(path: str | Path) -> SearchConfig:
     :raises ConfigError: naming the file and the key that is wrong
     """
     values = training.read_yaml(path)
-    for key, problem in (("path", "unknown key"), ("stages", "the key is called 'generations' now")):
-        if key in values:
-            raise ConfigError(f"{path}: {key}: {problem}")
+    if "path" in values:
+        raise ConfigError(f"{path}: path: unknown key")
     config = training.validated(SearchConfig, {**values, "path": str(path)}, str(path))
     try:
         AuxLossSampler(**config.sampler_settings())

@@ -24,8 +24,6 @@ def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
     """
     The best candidates of a search, the best first, in canonical form and each once.
 
-    :param study: A study of losses
-    :param top: How many
     :raises ValueError: when no candidate is complete
     """
     trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
@@ -82,11 +80,8 @@ def ranking(runs: pd.DataFrame) -> pd.DataFrame:
 
 def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
     """
-    Write the best candidate as YAML: a mapping whose ``aux_loss`` is what SACAux and hyper-parameter files take.
-
-    :param table: As returned by :func:`ranking`
-    :param path: The file
-    :return: The best candidate
+    Write the best candidate of a :func:`ranking` as YAML, a mapping whose ``aux_loss`` is what SACAux and hyper-parameter
+    files take, and return it.
     """
     winner = AuxLoss.parse(str(table.index[0]))
     score = {"mean_aulc": round(float(table["mean"].iloc[0]), 3), "runs": int(table["runs"].iloc[0])}

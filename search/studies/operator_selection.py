@@ -17,12 +17,7 @@ NEGATIVES = {True: "w/ negative samples", False: "w/o negative samples"}
 
 
 def make_matrix(config: SearchConfig, folder: Path) -> Matrix:
-    """
-    The runs: all operators, with and without negatives, on the loss inputs of forward dynamics.
-
-    :param config: The search, with a section ``operator_selection``
-    :param folder: Its folder; the runs are in its folder ``operators``
-    """
+    """The runs: all operators, with and without negatives, on the loss inputs of forward dynamics."""
     section = config.operator_selection
     if section is None:
         raise ConfigError(f"{config.path}: operator_selection is missing: environments, seeds")

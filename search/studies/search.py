@@ -30,15 +30,7 @@ def make_run(
     seed: int,
     overrides: Mapping[str, Any] | None = None,
 ) -> Run:
-    """
-    A training run with the settings of a search.
-
-    :param config: The search
-    :param environment: Id of the environment
-    :param aux_loss: The auxiliary loss, None for none
-    :param seed: Seed of the run
-    :param overrides: Merged over the hyper-parameters of the search
-    """
+    """A training run with the settings of a search, and overrides merged over its hyper-parameters."""
     hyperparameters = dict(config.hyperparameters_for(environment, overrides or {}))
     hyperparameters.pop("aux_loss", None)
     return Run(
@@ -54,12 +46,7 @@ def make_run(
 
 
 def runs_of(config: SearchConfig) -> Callable[[AuxLoss], list[Run]]:
-    """
-    What is trained for a candidate: one run for each training seed.
-
-    :param config: The search
-    :return: A function from a loss to its runs
-    """
+    """What is trained for a candidate: a function from a loss to its runs, one for each training seed."""
     template = make_run(config, config.environment, None, config.seeds[0])
 
     def make_runs(aux_loss: AuxLoss) -> list[Run]:
@@ -70,11 +57,8 @@ def runs_of(config: SearchConfig) -> Callable[[AuxLoss], list[Run]]:
 
 def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Study, AuxLossSampler]:
     """
-    Create or load the study of a search.
+    Create or load the study of a search, with its sampler.
 
-    :param config: The search
-    :param storage: Storage of the study
-    :return: The study and its sampler
     :raises ValueError: naming the setting that differs, when a study of this name was started with other settings
     """
     sampler = AuxLossSampler(**config.sampler_settings())
@@ -94,11 +78,7 @@ def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Stud
 
 
 def make_pruner(config: SearchConfig) -> BasePruner:
-    """
-    Optuna's pruner of a configuration.
-
-    :param config: The search
-    """
+    """Optuna's pruner of a configuration."""
     if config.pruner == "median":
         return MedianPruner()
     if config.pruner == "hyperband":
@@ -107,12 +87,7 @@ def make_pruner(config: SearchConfig) -> BasePruner:
 
 
 def baselines(config: SearchConfig, folder: Path) -> Matrix:
-    """
-    The runs that the candidates are compared with, on the environment and the seeds of the search.
-
-    :param config: The search
-    :param folder: Folder of the search; the runs are in its folder ``baselines``
-    """
+    """The runs that the candidates are compared with, on the environment and the seeds of the search."""
     environment, runs = config.environment, {}
     for seed, baseline in product(config.seeds, config.baselines):
         run = make_run(config, environment, baseline.aux_loss, seed, baseline.overrides)
@@ -121,11 +96,7 @@ def baselines(config: SearchConfig, folder: Path) -> Matrix:
 
 
 def settings(config: SearchConfig) -> dict[str, Any]:
-    """
-    All that decides the losses and the scores of a search, in plain values as they are read from JSON.
-
-    :param config: The search
-    """
+    """All that decides the losses and the scores of a search, in plain values as they are read from JSON."""
     run = make_run(config, config.environment, None, config.seed)
     values = run.model_dump(exclude={"aux_loss", "hyperparameters", "keep_model"}) | config.sampler_settings()
     values |= {"initial": [str(loss) for loss in values["initial"]], "seeds": config.seeds, "pruner": config.pruner}

@@ -20,12 +20,7 @@ UNFINISHED = "checkpoint.tmp"
 
 
 class TruncateAt(gym.Wrapper):
-    """
-    Truncate the episode after given steps: a checkpoint there needs no state of the environment.
-
-    :param env: The environment, without ``Monitor``
-    :param steps: Steps of this environment, counted from its first one on
-    """
+    """Truncate the episode after given steps of this environment: a checkpoint there needs no state of the environment."""
 
     def __init__(self, env: gym.Env, steps: Collection[int]):
         super().__init__(env)
@@ -40,22 +35,14 @@ class TruncateAt(gym.Wrapper):
 
 def restart_seed(seed: int, num_timesteps: int) -> int:
     """
-    The seed of what follows a checkpoint; environment i takes the i-th after it.
-
-    :param seed: Seed of the run
-    :param num_timesteps: Agent steps at the checkpoint
-    :return: A number from 2**31 on; evaluations and the beginnings of runs have those below
+    The seed of what follows a checkpoint at these agent steps, from 2**31 on: evaluations and the beginnings of runs have
+    those below. Environment i takes the i-th after it.
     """
     return 2**31 + int(np.random.SeedSequence((seed, num_timesteps)).generate_state(1)[0]) // 4
 
 
 def restart(model: SACAux, seed: int) -> None:
-    """
-    Start new episodes and random sequences, in an undisturbed run as in a resumed one.
-
-    :param model: The model, before the first action of a rollout
-    :param seed: Seed of the run
-    """
+    """Start new episodes and random sequences before a rollout, in an undisturbed run as in a resumed one."""
     env = model.get_env()
     assert env is not None
     # Python's, NumPy's and PyTorch's generators, the action space, and the environments at their next reset.
@@ -69,13 +56,7 @@ def restart(model: SACAux, seed: int) -> None:
 
 
 def save(folder: Path, model: SACAux, curve: Sequence[Evaluation]) -> None:
-    """
-    Replace the checkpoint of a run, in one step.
-
-    :param folder: Folder of the run
-    :param model: The model, at the end of all episodes
-    :param curve: Learning curve so far
-    """
+    """Replace the checkpoint of a run at the end of all episodes, in one step."""
     assert isinstance(model.replay_buffer, WindowReplayBuffer)
     state = {
         "model": model.training_state(),
@@ -91,11 +72,7 @@ def save(folder: Path, model: SACAux, curve: Sequence[Evaluation]) -> None:
 
 
 def read(folder: Path) -> dict[str, Any] | None:
-    """
-    The checkpoint of a run, None if there is none.
-
-    :param folder: Folder of the run
-    """
+    """The checkpoint of a run, None if there is none."""
     if not (folder / CHECKPOINT).exists():
         return None
     # Mapped into memory, so that the replay buffer is not there twice.
@@ -103,12 +80,7 @@ def read(folder: Path) -> dict[str, Any] | None:
 
 
 def load(model: SACAux, state: Mapping[str, Any]) -> None:
-    """
-    Put a checkpoint into a new model and its environment.
-
-    :param model: The model, with the same settings
-    :param state: As returned by :func:`read`
-    """
+    """Put a checkpoint into a new model with the same settings, and into its environment."""
     assert isinstance(model.replay_buffer, WindowReplayBuffer)
     model.load_training_state(state["model"])
     model.replay_buffer.load_training_state(state["replay_buffer"])
@@ -126,11 +98,7 @@ def _normalization_state(env: VecNormalize | None) -> dict[str, Any]:
 
 
 def remove(folder: Path) -> None:
-    """
-    Remove the checkpoint of a run: replay buffers are large.
-
-    :param folder: Folder of the run
-    """
+    """Remove the checkpoint of a run: replay buffers are large."""
     for name in (CHECKPOINT, UNFINISHED):
         (folder / name).unlink(missing_ok=True)
 

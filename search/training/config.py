@@ -82,21 +82,10 @@ def check_hyperparameters(values: Mapping[str, Any], env_id: str, source: str) -
     return validated(model, values, source).model_dump(exclude_unset=True)
 
 
-def named_environments(path: str | Path) -> list[str]:
-    """
-    The environments that have an entry of their own in a file of hyper-parameters.
-
-    :param path: The YAML file
-    :raises ConfigError: naming the file, when it cannot be read
-    """
-    return [key for key in read_yaml(path) if key != "default"]
-
-
 def load_aux_loss(path: str | Path) -> AuxLoss:
     """
-    Read the loss chosen by a cross-validation.
+    The loss that a cross-validation chose: the only key, ``aux_loss``, of a YAML file.
 
-    :param path: YAML file with ``aux_loss``: a notation, a name, or the mapping of ``AuxLoss.to_dict``
     :raises ConfigError: naming the file and what is wrong with it
     """
     values = read_yaml(path)
@@ -109,19 +98,15 @@ def load_aux_loss(path: str | Path) -> AuxLoss:
 
 
 def action_repeat(hyperparameters: Mapping[str, Any]) -> int:
-    """
-    Environment steps of one agent step.
-
-    :param hyperparameters: As returned by :func:`load_hyperparameters`
-    """
+    """Environment steps of one agent step."""
     return (hyperparameters.get("env_kwargs") or {}).get("action_repeat", 1)
 
 
 def resolve_env_id(name: str) -> str:
     """
-    The id of an environment.
+    The id of an environment, registered or the short form of a DeepMind Control task, such as ``cheetah-run`` or
+    ``Cheetah-Run``.
 
-    :param name: A registered id, or the short form of a DeepMind Control task, such as ``cheetah-run`` or ``Cheetah-Run``
     :raises ConfigError: for an unknown one, with the nearest
     """
     full = f"{PREFIX}{name.lower()}-v0"
@@ -137,9 +122,8 @@ def resolve_env_id(name: str) -> str:
 
 def import_modules(names: Sequence[str]) -> Sequence[str]:
     """
-    Import a user's own modules, which register environments; those in the working directory too.
+    Import a user's own modules, which register environments, those in the working directory too, and return their names.
 
-    :param names: Names of the modules, which are returned
     :raises ConfigError: naming the module that cannot be imported
     """
     if str(Path.cwd()) not in sys.path:  # it is there for `python -m`, and not for the program `aarl`
@@ -153,12 +137,7 @@ def import_modules(names: Sequence[str]) -> Sequence[str]:
 
 
 def merge(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Merge a mapping over another one, and mappings in it likewise.
-
-    :param values: The mapping
-    :param others: What wins
-    """
+    """Merge a mapping over another one, and mappings in it likewise."""
     merged = dict(values)
     for key, value in others.items():
         old = merged.get(key)
@@ -190,7 +169,6 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     """
     The mapping in a YAML file. Nothing in it is evaluated.
 
-    :param path: The file
     :raises ConfigError: naming the file, and the line where it is not YAML
     """
     try:
@@ -211,10 +189,7 @@ def validated(model_class: type[Model], values: Mapping[str, Any], source: str) 
     """
     A model of plain values. A number in quotes is text, a truth value is no number; a list will do for a tuple.
 
-    :param model_class: The model
-    :param values: Plain values
-    :param source: Where they are from, for messages
-    :raises ConfigError: one line for each problem, with the source and the key
+    :raises ConfigError: one line for each problem, with the source of the values and the key
     """
     try:
         # Pydantic's strict mode takes a list for a tuple in JSON only.
@@ -292,8 +267,6 @@ def _hyperparameters_model(is_dmc: bool, policy: str, encoder: str, has_argument
     """
     The model of an environment's hyper-parameters: the arguments of SACAux, its policy and so on.
 
-    :param is_dmc: Whether the environment is a task of DeepMind Control
-    :param policy: Name of the policy
     :param encoder: Name of the encoder; "None", or an unknown one, for the policy's own
     :param has_arguments: Whether ``normalize`` is a mapping of arguments
     """

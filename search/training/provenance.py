@@ -79,44 +79,23 @@ def provenance() -> dict[str, str]:
 
 
 def read_about(path: Path) -> dict[str, Any]:
-    """
-    The ``provenance.json`` of a run, empty if there is none.
-
-    :param path: Folder of the run
-    """
+    """The ``provenance.json`` in the folder of a run, empty if there is none."""
     file = path / ABOUT
     return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
 
 
 def write_about(path: Path, about: Mapping[str, Any]) -> None:
-    """
-    Write the ``provenance.json`` of a run, in one step.
-
-    :param path: Folder of the run
-    :param about: Plain values
-    """
+    """Write the ``provenance.json`` of a run, in one step."""
     replace_text(path / ABOUT, json.dumps(about, indent=1) + "\n")
 
 
-def add_session(path: Path, about: Mapping[str, Any], **session: Any) -> None:
-    """
-    Add a session, in which a run was started or resumed, to its ``provenance.json``.
-
-    :param path: Folder of the run
-    :param about: Values of the run; those that are there already stay
-    :param session: Values of the session, beside :func:`provenance`
-    """
-    before = read_about(path)
-    sessions = [*before.get("sessions", ()), {**provenance(), **session}]
-    write_about(path, {**about, **before, "sessions": sessions})
+def add_session(path: Path, **session: Any) -> None:
+    """Add a session, in which a run is started or resumed, to its ``provenance.json``: values and :func:`provenance`."""
+    about = read_about(path)
+    write_about(path, {**about, "sessions": [*about.get("sessions", ()), {**provenance(), **session}]})
 
 
 def save_result(path: Path, **result: Any) -> None:
-    """
-    Write a result as JSON, with :func:`provenance` beside it.
-
-    :param path: File
-    :param result: What was measured, plain values
-    """
+    """Write what was measured, plain values, to a file as JSON, with :func:`provenance` beside it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({**provenance(), **result}, indent=1) + "\n")

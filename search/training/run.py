@@ -90,8 +90,6 @@ def prepare_run(folder: Path, run: Run) -> None:
     """
     Make the folder of a run, or take the one that it has already. Files that ended it before are deleted.
 
-    :param folder: The folder
-    :param run: The run
     :raises ValueError: when the folder has another run, naming the key that differs
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -107,11 +105,7 @@ def prepare_run(folder: Path, run: Run) -> None:
 
 
 def read_outcome(folder: Path) -> Outcome | None:
-    """
-    How a run ended, None as long as it did not: it runs, waits, or was killed or told to stop.
-
-    :param folder: Folder of the run
-    """
+    """How a run ended, None as long as it did not: it runs, waits, or was killed or told to stop."""
     curve = read_curve(folder / CURVE) if (folder / CURVE).exists() else []
     if is_finished(folder):
         return Outcome(curve, None, False)
@@ -122,11 +116,7 @@ def read_outcome(folder: Path) -> Outcome | None:
 
 
 def is_finished(folder: Path) -> bool:
-    """
-    Whether a run has its complete curve, and its model if that is kept.
-
-    :param folder: Folder of the run
-    """
+    """Whether a run has its complete curve, and its model if that is kept."""
     if not (folder / RUN).exists() or not (folder / CURVE).exists():
         return False
     run = _read_run(folder)
@@ -149,12 +139,7 @@ def _differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, Any
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any]) -> gym.Env:
-    """
-    An environment of a configuration.
-
-    :param env_id: Id of a DeepMind Control task, or of any other Gymnasium environment
-    :param env_kwargs: Arguments of ``make_dmc_env``, or of ``wrap_env``
-    """
+    """An environment with the ``env_kwargs`` of a configuration: of ``make_dmc_env``, or of ``wrap_env`` for any other id."""
     if env_id.startswith(PREFIX):
         return make_dmc_env(env_id, **env_kwargs)
     arguments: dict[str, Any] = {"render_mode": "rgb_array"} if env_kwargs.get("pixels") else {}
@@ -162,11 +147,7 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any]) -> gym.Env:
 
 
 def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
-    """
-    Environment steps of one rollout: every checkpoint is a multiple of them.
-
-    :param hyperparameters: As returned by ``load_hyperparameters``
-    """
+    """Environment steps of one rollout with these hyper-parameters: every checkpoint is a multiple of them."""
     train_freq = hyperparameters.get("train_freq", 1)
     rollout = train_freq if isinstance(train_freq, int) else 1 if train_freq[1] == "episode" else train_freq[0]
     return rollout * hyperparameters.get("n_envs", 1) * action_repeat(hyperparameters)
@@ -174,11 +155,8 @@ def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
 
 def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int = 1) -> tuple[int, ...]:
     """
-    Equally spaced checkpoints; the last is a little early where they do not divide the run.
+    Equally spaced checkpoints, multiples of an interval; the last is a little early where they do not divide the run.
 
-    :param environment_steps: Environment steps of the run
-    :param n_evaluations: Number of checkpoints
-    :param interval: Each is a multiple of it, see :func:`checkpoint_interval`
     :raises ValueError: when there are too few steps for so many checkpoints
     """
     if n_evaluations < 1 or environment_steps < n_evaluations * interval:
@@ -255,7 +233,6 @@ def check_run(run: Run) -> None:
     """
     Make environment and model of a run once.
 
-    :param run: The run
     :raises ConfigError: in one line, when they cannot be made of its settings
     """
     try:
@@ -334,7 +311,7 @@ def _train(
             goes_on = on_evaluation is None or on_evaluation(evaluations.curve) is not False
             return goes_on and not (folder / STOP).exists()
 
-        add_session(folder, _description(run), aux_loss=str(model.aux_loss), device=str(model.device), threads=run.threads)
+        add_session(folder, aux_loss=str(model.aux_loss), device=str(model.device), threads=run.threads)
         checkpoints = checkpoint.CheckpointCallback(folder, run.seed, evaluations.curve, report, state)
         del state  # mapped from a file that will be replaced
         model.learn(setup.agent_steps, [evaluations, checkpoints], progress_bar=progress_bar)
@@ -345,14 +322,6 @@ def _train(
                 unfinished.replace(folder / MODEL)
             write_about(folder, {**read_about(folder), "seconds": evaluations.curve[-1].seconds})
             report()
-
-
-def _description(run: Run) -> dict[str, Any]:
-    """The keys of a run in ``provenance.json``."""
-    values = run.model_dump(mode="json")
-    names = ("environment", "aux_loss", "seed", "hyperparameters", "evaluation_episodes")
-    about = {name: values[name] for name in names}
-    return {**about, "aux_loss": str(run.aux_loss), "evaluations": values["checkpoints"]}
 
 
 def _end_with_stdin() -> None:
