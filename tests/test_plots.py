@@ -22,7 +22,6 @@ from search.results.plots import (
     evolution_figure,
     evolution_plot,
     histogram_plot,
-    learning_curves_figure,
     learning_curves_plot,
     patterns_plot,
     rankings_plot,
@@ -92,17 +91,6 @@ def test_evolution_names_the_candidates():
 def test_figures_are_plain_numbers(trials):
     """The plotly.js of the dashboard does not know the packed arrays of newer ones."""
     assert "bdata" not in evolution_figure(analysis.trial_table(trials), BASELINES).to_json()
-
-
-def test_learning_curves_of_trials_that_have_one():
-    curve = [[1000, 1.5, 0.5], [2000, 3.0, 0.25]]
-    trials = make_trials(make_trial(1.0, curve=curve), make_trial(1.0), make_trial(1.0, curve=curve[:1]))
-    figure = learning_curves_figure(trials)
-    assert [trace.name for trace in figure.data] == ["trial 0", "trial 2"]
-    assert figure.data[0].x == (1000, 2000) and figure.data[0].y == (1.5, 3.0)
-    assert figure.data[0].error_y.array == (0.5, 0.25)
-    looks = {(trace.line.dash, trace.marker.symbol) for trace in learning_curves_figure(trials[:1] * 5).data}
-    assert len(looks) == 5  # they differ in grey
 
 
 def test_ranked_and_losses(trials):

@@ -15,16 +15,13 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial
 
 from sb3_aarl.aux_loss import AuxLoss
 from search.results import analysis
 from search.results.rankings import leading, rank_agreement, rankings
-from search.results.trials import curve_of
 
-# Lines differ by dash and marker, not by colour alone: they have to be told apart in grey.
+# Lines differ by dash, not by colour alone: they have to be told apart in grey.
 DASHES = ("dash", "dot", "dashdot", "longdash", "longdashdot")
-MARKERS = ("circle", "square", "diamond", "triangle-up", "cross")
 BLUE, ORANGE, GREY = "#1f4e79", "#c55a11", "#444444"
 COLOURS = (BLUE, ORANGE, "#000000", "#7f7f7f", "#6aa7d6")
 # The same in matplotlib's names.
@@ -86,8 +83,20 @@ def evolution_figure(
             line={"dash": DASHES[position % len(DASHES)], "color": COLOURS[2 + position % 3], "width": 1.5},
             hovertemplate=f"{escape(name)}: %{{y:.1f}}<extra></extra>",
         )
-    _style(figure, "Evolution of auxiliary losses", "Generation", SCORE)
-    figure.update_xaxes(range=ends, tickmode="array", tickvals=generations, showgrid=False)
+    figure.update_layout(
+        template="none",
+        title={"text": "Evolution of auxiliary losses", "font": {"size": 16}, "x": 0.01, "xanchor": "left"},
+        font={"family": "system-ui, sans-serif", "size": 13, "color": "#222222"},
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+        showlegend=True,
+        legend={"orientation": "h", "yanchor": "top", "y": -0.18, "x": 0},
+        margin={"l": 70, "r": 20, "t": 50, "b": 60},
+        hovermode="closest",
+    )
+    ticks = {"tickmode": "array", "tickvals": generations, "showgrid": False}
+    figure.update_xaxes(title={"text": "Generation"}, range=ends, **AXIS | ticks)
+    figure.update_yaxes(title={"text": SCORE, "standoff": 12}, automargin=True, **AXIS)
     return figure
 
 
@@ -102,41 +111,6 @@ def _generation_lines(trials: pd.DataFrame, direction: StudyDirection) -> Iterat
     best = groups.max() if direction == StudyDirection.MAXIMIZE else groups.min()
     yield "best of the generation", best, ORANGE, "triangle-up", "^"
     yield "mean of the generation", groups.mean(), BLUE, "square", "s"
-
-
-def learning_curves_figure(trials: Iterable[FrozenTrial]) -> go.Figure:
-    """The learning curves of some trials, with standard deviations as bars; trials without a curve are skipped."""
-    figure = go.Figure()
-    for position, trial in enumerate(trial for trial in trials if curve_of(trial)):
-        steps, means, deviations = map(list, zip(*curve_of(trial), strict=True))
-        figure.add_scatter(
-            x=steps,
-            y=means,
-            error_y={"array": deviations, "thickness": 1, "width": 3},
-            name=f"trial {trial.number}",
-            mode="lines+markers",
-            line={"dash": ("solid", *DASHES)[position % 5], "color": COLOURS[position % len(COLOURS)], "width": 2},
-            marker={"size": 8, "symbol": MARKERS[position % len(MARKERS)]},
-            hovertemplate=f"trial {trial.number}, step %{{x}}: %{{y:.1f}}<extra></extra>",
-        )
-    _style(figure, "Learning curves of the best", "Environment steps", "Return (mean ± std of the episodes)")
-    return figure
-
-
-def _style(figure: go.Figure, title: str, x_label: str, y_label: str) -> None:
-    figure.update_layout(
-        template="none",
-        title={"text": title, "font": {"size": 16}, "x": 0.01, "xanchor": "left"},
-        font={"family": "system-ui, sans-serif", "size": 13, "color": "#222222"},
-        paper_bgcolor="white",
-        plot_bgcolor="white",
-        showlegend=True,
-        legend={"orientation": "h", "yanchor": "top", "y": -0.18, "x": 0},
-        margin={"l": 70, "r": 20, "t": 50, "b": 60},
-        hovermode="closest",
-    )
-    figure.update_xaxes(title={"text": x_label}, **AXIS)
-    figure.update_yaxes(title={"text": y_label, "standoff": 12}, automargin=True, **AXIS)
 
 
 def evolution_plot(

@@ -24,7 +24,7 @@ from search.execution.matrix import Cell, comparable, task_name
 from search.results import analysis
 from search.results import table as tables
 from search.results.notation import mathml
-from search.results.plots import evolution_figure, learning_curves_figure, learning_curves_plot, patterns_plot, rankings_plot
+from search.results.plots import evolution_figure, learning_curves_plot, patterns_plot, rankings_plot
 from search.results.trials import lineage, ranked
 from search.studies import cross_validation
 from search.studies.benchmark import read_curves
@@ -33,7 +33,6 @@ from search.training.provenance import ABOUT, provenance, read_about
 from search.training.run import is_finished
 
 N_BEST = 10
-N_CURVES = 5
 N_IMPORTANCES = 12
 
 
@@ -88,8 +87,6 @@ def write_report(
     table = analysis.trial_table(trials)
     best = ranked(trials, study.direction)
     baselines = list(baselines)
-    curves = learning_curves_figure(best[:N_CURVES])
-    plots = [evolution_figure(table, baselines, study.direction)] if best else []
     machines = analysis.machines(trials)
     started = [f"{trial.datetime_start:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_start]
     ended = [f"{trial.datetime_complete:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_complete]
@@ -103,7 +100,7 @@ def write_report(
         hours=machines["hours"].sum(),
         generations=analysis.readable("generations", generation_table(table)),
         baselines=baselines,
-        plots=_plots([*plots, curves] if curves.data else plots),
+        evolution=_plot(evolution_figure(table, baselines, study.direction)) if best else None,
         best=_candidates(best[:N_BEST]),
         winner=_candidates(best[:1]).to_dict("records"),
         lineage=_candidates(sorted(lineage(best[0], trials), key=lambda trial: -trial.number)) if best else None,
@@ -187,11 +184,8 @@ def _picture(figure: Figure) -> str:
     return f"data:image/svg+xml;base64,{b64encode(file.getvalue()).decode()}"
 
 
-def _plots(figures: Sequence[go.Figure]) -> list[Markup]:
-    """The plots as HTML; the first of them contains plotly.js."""
+def _plot(figure: go.Figure) -> Markup:
+    """A plot as HTML that contains plotly.js."""
     # Without the button that would send the data to plotly's cloud.
     config = {"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["sendChartToCloud"]}
-    return [
-        Markup(to_html(figure, config=config, include_plotlyjs=position == 0, full_html=False, default_height="520px"))
-        for position, figure in enumerate(figures)
-    ]
+    return Markup(to_html(figure, config=config, full_html=False, default_height="520px"))
