@@ -110,7 +110,6 @@ def executor(monkeypatch: pytest.MonkeyPatch) -> Executor:
     monkeypatch.setattr("search.execution.runs.LocalExecutor", executor)
     monkeypatch.setattr("search.execution.matrix.POLL_SECONDS", 0)
     monkeypatch.setattr("search.execution.driver.POLL_SECONDS", 0)
-    monkeypatch.setattr("search.results.dashboard.learning_curve_png", lambda *arguments: b"")
     for module in ("search", "matrices"):
         # A narrow one would break lines.
         monkeypatch.setattr(f"search.cli.{module}.console", Console(width=200))

@@ -156,7 +156,7 @@ def test_analyze_compares_studies(study: optuna.Study) -> None:
         (["analyze", "other", "--storage", "sqlite:///runs/one/study.db"], "no study 'other'. The storage has: one"),
         (["analyze", "--pattern", "{s_t}"], "{s_t}"),
         (["figures", "patterns", "--pattern", "curll"], "nearest: curl"),
-        (["figures", "evolution", "--out", "x.txt"], "x.txt: figures are written as"),
+        (["figures", "evolution", "--out", "x.txt"], "Format 'txt' is not supported"),
         (["figures", "curves"], "runs/benchmark has no learning curves"),
         (["figures", "evolution", "runs/benchmark"], "runs/benchmark has no study"),
     ],

@@ -104,9 +104,6 @@ def candidates(studies: Studies) -> "dict[str, pd.DataFrame]":
 def write_figure(figure: "Figure", out: Path | None, name: str = "", studies: Studies | None = None) -> None:
     """Write a figure to a file, or under its name into the folder of the first study."""
     path = out or next(folder for _, folder in (studies or {}).values()) / f"{name}.png"
-    kinds = figure.canvas.get_supported_filetypes()
-    if path.suffix.removeprefix(".") not in kinds:
-        raise ValueError(f"{path}: figures are written as .{', .'.join(sorted(kinds))}")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     say(f"Figure: {path}")

@@ -20,10 +20,9 @@ def _build(horizon: int, source: Bits, target: Bits, operator: str, negatives: b
 
 def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str] | None = None) -> AuxLoss:
     """
-    Flip each bit of both masks with probability 1 / (2 (3k + 1)), k being the horizon, independently.
+    Flip each bit of both masks with probability 1 / (2 (3k + 1)), k being the horizon, independently. Where operators are
+    searched too (the paper does not say how), the operator is redrawn and negatives are switched with the same probability.
 
-    :param operators: Operators that are searched too (the paper does not say how): with the same probability each, the
-        operator is redrawn and negatives are switched; None to keep both
     :raises RejectedLoss: when the offspring is not valid
     """
     flip_rate = 1 / (2 * (3 * loss.horizon + 1))
@@ -50,9 +49,8 @@ def crossover(loss: AuxLoss, other: AuxLoss, rng: np.random.Generator) -> AuxLos
 
 def horizon_change(loss: AuxLoss, rng: np.random.Generator, max_horizon: int = MAX_HORIZON) -> AuxLoss:
     """
-    Drop the last step (action, reward, state) of both masks, or append three random bits to each.
-
-    Both ways are equally probable; at the ends of 1..max_horizon only one is left.
+    Drop the last step (action, reward, state) of both masks, or append three random bits to each. Both ways are equally
+    probable; at the ends of 1..max_horizon only one is left.
 
     :raises RejectedLoss: when the offspring is not valid, or the space has one horizon only
     """

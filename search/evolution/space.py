@@ -60,9 +60,7 @@ def loss_to_params(loss: AuxLoss, operators: Sequence[str] | None = None) -> dic
     """
     The parameters of a loss, for ``study.enqueue_trial`` and the sampler.
 
-    :param loss: The loss
-    :param operators: As in :func:`distributions`
-    :raises ValueError: when its operator, or negatives, are not in the space
+    :raises ValueError: when its operator, or negatives, are not in the space of :func:`distributions`
     """
     is_in_space = (loss.operator, loss.negatives) == ("mse", False) if operators is None else loss.operator in operators
     if not is_in_space:
@@ -75,9 +73,8 @@ def loss_to_params(loss: AuxLoss, operators: Sequence[str] | None = None) -> dic
 
 def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
     """
-    The loss of a trial's parameters.
+    The loss of a trial's parameters; others are ignored.
 
-    :param params: As :func:`loss_to_params` returns them; others are ignored
     :raises KeyError: when parameters are missing
     :raises ValueError: when the loss is not valid
     """
@@ -163,13 +160,7 @@ def _draw(
 
 
 def random_loss(rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
-    """
-    A loss whose horizon is uniform and whose bits are Bernoulli(0.5), invalid ones redrawn (paper, A.3).
-
-    :param rng: Source of randomness
-    :param max_horizon: Longest horizon of the space
-    :param operators: Operators to draw from, None for mean squared error without negatives
-    """
+    """A loss whose horizon is uniform and whose bits are Bernoulli(0.5), invalid ones redrawn (paper, A.3)."""
     return _draw(rng, max_horizon, operators)
 
 
@@ -180,8 +171,7 @@ def forward_dynamics_prior(
     A loss that resembles forward dynamics (paper, A.3): states of the source Bernoulli(0.2), its actions
     Bernoulli(0.8), states of the target those that are not in the source, all other bits Bernoulli(0.5).
 
-    The paper prints "target" for the first of these; only with the source does its third rule make sense. Arguments as in
-    :func:`random_loss`.
+    The paper prints "target" for the first of these; only with the source does its third rule make sense.
     """
     return _draw(rng, max_horizon, operators, source=(0.2, 0.8, 0.5), flips_states=True)
 
@@ -191,7 +181,7 @@ def reward_prediction_prior(
 ) -> AuxLoss:
     """
     A loss that resembles reward prediction (paper, A.3): rewards of the target Bernoulli(0.8), no states and actions
-    in the target, the source Bernoulli(0.5). Arguments as in :func:`random_loss`.
+    in the target, the source Bernoulli(0.5).
     """
     return _draw(rng, max_horizon, operators, target=(0.0, 0.0, 0.8))
 

@@ -40,7 +40,7 @@ def load_benchmark(
     :param files: Files of hyper-parameters, as ``load_hyperparameters`` reads them; the variants have their names
     :param environments: Ids or short forms; none for those that all files name
     :param seeds: Seeds of the runs on each
-    :param checkpoints: Environment steps of the comparison, ascending; none for those of 100k, 500k and 1000k that lie in
+    :param checkpoints: Environment steps of the comparison; none for those of 100k, 500k and 1000k that lie in
         every file's ``n_timesteps``
     :param every: Environment steps after which runs are also evaluated
     :param evaluation_episodes: Episodes of each evaluation
@@ -51,15 +51,13 @@ def load_benchmark(
     for stem, count in Counter(path.stem for path in files).items():
         if count > 1:
             raise ConfigError(f"two files are called {stem}: a variant has the name of its file")
-    if len(set(seeds)) < len(seeds) or any(not 0 <= seed < 2**32 for seed in seeds):
-        raise ConfigError(f"seeds must be different numbers from 0 to 2**32 - 1, not {list(seeds)}")
     names = environments or _common_environments(files)
     ids = list(dict.fromkeys(resolve_env_id(name) for name in names))
     # SACAux's default, written out: a file that names no loss is not one that says "none".
     hyperparameters = {
         (path.stem, name): {"aux_loss": "auto", **load_hyperparameters(path, name)} for path in files for name in ids
     }
-    compared = {name: tuple(checkpoints) or _default_checkpoints(name, hyperparameters) for name in ids}
+    compared = {name: tuple(sorted(set(checkpoints))) or _default_checkpoints(name, hyperparameters) for name in ids}
     paths = {path.stem: str(path) for path in files}
     runs: dict[Cell, Run] = {}
     abouts: dict[Cell, dict[str, Any]] = {}
@@ -142,7 +140,7 @@ def parse_steps(text: str) -> tuple[int, ...]:
     """
     steps = []
     for part in text.split(","):
-        match = re.fullmatch(r"(\d+)([km]?)", part.strip().lower())
+        match = re.fullmatch(r"([1-9]\d*)([km]?)", part.strip().lower())
         if match is None:
             raise ValueError(f"environment steps are written like 100k, 1M or 20000, not {part.strip()!r}")
         steps.append(int(match[1]) * UNITS[match[2]])
@@ -184,10 +182,6 @@ def _default_checkpoints(environment: str, hyperparameters: Mapping[tuple[str, s
 
 def _evaluations(checkpoints: Sequence[int], every: int | None, interval: int, cell: Cell) -> tuple[int, ...]:
     """The environment steps of all evaluations of a run."""
-    if sorted(set(checkpoints)) != list(checkpoints) or checkpoints[0] < 1:
-        raise ConfigError(f"checkpoints must be positive environment steps in ascending order, not {list(checkpoints)}")
-    if every is not None and every < 1:
-        raise ConfigError(f"every must be at least 1, not {every}")
     between = () if every is None else range(every, checkpoints[-1], every)
     steps = sorted({*checkpoints, *between})
     for step in steps:

@@ -73,13 +73,7 @@ class Run(pydantic.BaseModel, frozen=True, extra="forbid"):
 
 
 class Outcome(NamedTuple):
-    """
-    How a run ended.
-
-    :param curve: Its learning curve, complete if it did not fail
-    :param failure: The reason in one line, None if it did not fail
-    :param retry: Whether the same run may well succeed: the candidate was not at fault
-    """
+    """How a run ended: its curve so far, the reason in one line if it failed, and whether a repetition may succeed."""
 
     curve: list[Evaluation]
     failure: str | None
@@ -268,7 +262,6 @@ def train(
     bit for bit like an undisturbed one if ``reset(seed)`` determines all that its environment does.
 
     :param folder: Folder that :func:`prepare_run` has prepared
-    :param progress_bar: Whether to show a progress bar
     :param on_evaluation: Called with the curve so far after each evaluation; the run ends early if it returns False, as it
         does if there is a file ``stop`` in the folder
     :return: The learning curve; that of a finished run is read, not trained again
