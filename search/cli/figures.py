@@ -30,11 +30,9 @@ def evolution(folders: SearchFolders = None, storage: Storage = None, out: Out =
     from search.results.report import stored_baselines
 
     studies = open_studies(folders, storage)
-    directions = {found.direction for found, _ in studies.values()}
-    if len(directions) > 1:
-        raise ValueError(f"some of {', '.join(studies)} are maximized and some minimized: draw them separately")
+    direction, *_ = (found.direction for found, _ in studies.values())
     lines = {name: stored_baselines(folder) for name, (_, folder) in studies.items()}
-    write_figure(evolution_plot(candidates(studies), lines, directions.pop()), out, "evolution", studies)
+    write_figure(evolution_plot(candidates(studies), lines, direction), out, "evolution", studies)
 
 
 @app.command()

@@ -15,8 +15,7 @@ def rankings(table: pd.DataFrame) -> pd.DataFrame:
 
     :param table: Trials that can be compared, as returned by ``analysis.analysed``
     :return: One row a trial that has a curve, in the order of AULC: ``number``, ``loss``, ``curve``, ``aulc`` (mean return
-        over all checkpoints), ``first`` and ``last`` (mean return at the first and the last checkpoint), ``rank_aulc``,
-        ``rank_first``, ``rank_last`` (1 is the highest return, equals share the better rank)
+        over all checkpoints), ``first`` and ``last`` (mean return at the first and the last checkpoint), and the ranks by them
     :raises ValueError: when no trial has a learning curve, or they have different checkpoints
     """
     trials = table[table["curve"].map(len) > 0]
@@ -35,12 +34,8 @@ def rankings(table: pd.DataFrame) -> pd.DataFrame:
 
 def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
     """
-    How far the three metrics agree on which losses are good.
-
-    :param ranking: As returned by :func:`rankings`
-    :param top: Size of the leading groups that are compared
-    :return: One row a pair of metrics: ``spearman`` and ``kendall`` (rank correlations over all trials), and ``shared``: how
-        many trials are among the best ``top`` under both
+    How far the three metrics agree on which losses are good: one row a pair of metrics with ``spearman`` and ``kendall`` (rank
+    correlations over all trials), and ``shared``: how many trials are among the best ``top`` under both.
     """
     rows = {}
     for pair in combinations(METRICS, 2):

@@ -57,12 +57,8 @@ Checkpoints = Annotated[tuple[PositiveInt, ...], AfterValidator(_ascending)]
 
 class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     """
-    Cross-validation of a search's best candidates (paper, A.4).
-
-    :param environments: Ids of the environments
-    :param seeds: Seeds of the runs on each
-    :param top: How many candidates
-    :param checkpoints: Environment steps of the evaluations, for environments that differ from the search's
+    Cross-validation of the ``top`` candidates of a search (paper, A.4), with the environment steps of the evaluations on
+    environments that differ from the search's.
     """
 
     environments: Environments
@@ -72,12 +68,7 @@ class CrossValidation(BaseModel, frozen=True, extra="forbid"):
 
 
 class OperatorSelection(BaseModel, frozen=True, extra="forbid"):
-    """
-    Comparison of the ten operators (paper, A.1.3).
-
-    :param environments: Ids of the environments
-    :param seeds: Seeds of the runs on each
-    """
+    """Comparison of the ten operators (paper, A.1.3)."""
 
     environments: Environments
     seeds: Seeds = (0, 1, 2, 3, 4)
@@ -85,11 +76,8 @@ class OperatorSelection(BaseModel, frozen=True, extra="forbid"):
 
 class Baseline(BaseModel, frozen=True, extra="forbid"):
     """
-    A run that the candidates are compared with (the lines of the paper's figures 4 and 6).
-
-    :param name: Its name
-    :param aux_loss: Its auxiliary loss, None for none
-    :param overrides: Merged over the hyper-parameters of the search
+    A run that the candidates are compared with (the lines of the paper's figures 4 and 6), with overrides merged over the
+    hyper-parameters of the search.
     """
 
     name: str

@@ -19,12 +19,10 @@ class Objective:
 
     Each evaluation is reported at its environment steps, and the trial is pruned if its pruner says so. Several seeds are
     trained one after the other; the curve of the first one is reported, and a pruned trial is spared the other seeds.
-
-    User attributes of a trial: ``loss`` and ``canonical`` (notation), ``environment``; ``curve`` (a list of [environment
-    steps, mean, standard deviation] over the episodes of all seeds) and ``seconds`` when it ends; ``reason`` when the
-    candidate failed; ``interrupted`` after Ctrl-C, so that AuxLossSampler proposes the same loss again.
-
     ``study.optimize(objective, catch=(FloatingPointError,))`` goes on after a loss that diverges.
+
+    The trial has the user attributes that the driver of a search writes: ``loss`` and ``canonical`` (notation),
+    ``environment``, ``curve``, ``seconds``; ``reason`` of a failure; ``interrupted`` after Ctrl-C.
 
     :param config: The search
     :param folder: Folder of the search; the runs are in its folder ``candidates``
@@ -37,8 +35,8 @@ class Objective:
 
     def __call__(self, trial: optuna.Trial) -> float:
         """
-        :param trial: Proposes the candidate
-        :return: Mean AULC over the seeds
+        Train the candidate of a trial.
+
         :raises optuna.TrialPruned: for an invalid candidate, before anything is trained, and for a pruned one
         :raises FloatingPointError: when its loss is not finite, or its Q values explode
         """

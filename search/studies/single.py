@@ -30,10 +30,6 @@ def train_one(
         hyper-parameters says, or ``"auto"``
     :param config: File of hyper-parameters
     :param environment_steps: Environment steps of the run, None for the file's ``n_timesteps``
-    :param n_evaluations: Number of evaluations
-    :param evaluation_episodes: Episodes of each
-    :param seed: Seed of the run
-    :param threads: Threads of PyTorch
     :param folder: Folder of the run, None for one in ``runs`` named after environment, loss and settings
     :return: The learning curve, the folder, and whether the run was finished before
     :raises ValueError: when something is unknown or does not fit, or the folder has another run
