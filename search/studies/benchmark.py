@@ -15,7 +15,7 @@ from sb3_aarl.envs import PREFIX
 from search.execution.matrix import Cell, Matrix, all_cells, task_name
 from search.training.config import ConfigError, action_repeat, load_hyperparameters, read_yaml, resolve_env_id
 from search.training.provenance import ABOUT, read_about
-from search.training.run import Run, check_run, checkpoint_interval
+from search.training.run import Run, check_run, checkpoint_interval, differences
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
@@ -207,8 +207,7 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any], *keys: str) ->
     # Runs that were trained by another program name it.
     keys = (*keys, "evaluation_episodes", "program")
     old, new = ({key: about.get(key) for key in keys} | about.get("hyperparameters", {}) for about in (one, other))
-    differing = (key for key in old | new if key not in SCORELESS and old.get(key) != new.get(key))
-    return next(((key, old.get(key), new.get(key)) for key in differing), None)
+    return next((found for found in differences(old, new) if found[0] not in SCORELESS), None)
 
 
 def _check_models(matrix: Matrix) -> None:

@@ -16,7 +16,7 @@ from sb3_aarl.aux_loss import AuxLoss
 from search.evolution.sampler import AuxLossSampler
 from search.execution.matrix import Cell, Matrix
 from search.studies.config import SearchConfig
-from search.training.run import Run
+from search.training.run import Run, differences
 
 SETTINGS_KEY = "settings"  # user attribute of a study
 # Settings that may change when a search is resumed.
@@ -111,8 +111,7 @@ def _difference(study: optuna.Study, config: SearchConfig) -> str | None:
     if stored is None:
         has_trials = any(trial.state != TrialState.WAITING for trial in study.get_trials(deepcopy=False))
         return "it has trials of another program" if has_trials else None
-    for key in stored | wanted:
-        old, new = stored.get(key), wanted.get(key)
-        if old != new and key not in FREE:
+    for key, old, new in differences(stored, wanted):
+        if key not in FREE:
             return f"it was started with {key}={old!r}, not {new!r}"
     return None

@@ -90,7 +90,7 @@ def prepare_run(folder: Path, run: Run) -> None:
     values = run.model_dump(mode="json")
     if (folder / RUN).exists():
         stored = _read_run(folder).model_dump(mode="json")
-        for key, ours, theirs in _differences(values, stored):
+        for key, ours, theirs in differences(values, stored):
             if key not in [f"hyperparameters.{name}" for name in FREE]:
                 raise ValueError(f"{folder} has another run: {key} is {theirs!r} there, not {ours!r}. Choose another folder")
     replace_text(folder / RUN, json.dumps(values, indent=1) + "\n")
@@ -123,11 +123,11 @@ def _read_run(folder: Path) -> Run:
     return validated(Run, json.loads(path.read_text(encoding="utf-8")), str(path))
 
 
-def _differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+def differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Keys with dots, and both values, where two plain values differ."""
     if isinstance(one, dict) and isinstance(other, dict):
         for name in {**one, **other}:
-            yield from _differences(one.get(name), other.get(name), f"{key}.{name}" if key else name)
+            yield from differences(one.get(name), other.get(name), f"{key}.{name}" if key else name)
     elif one != other:
         yield key, one, other
 
