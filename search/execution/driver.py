@@ -159,8 +159,9 @@ class Driver:
     def _interrupt(self, number: int) -> None:
         study_id = self.storage.get_study_id_from_name(self.study.study_name)
         trial_id = self.storage.get_trial_id_from_study_id_trial_number(study_id, number)
-        self.storage.set_trial_user_attr(trial_id, "interrupted", True)
-        self.study.tell(number, state=TrialState.FAIL, skip_if_finished=True)
+        if not self.storage.get_trial(trial_id).state.is_finished():
+            self.storage.set_trial_user_attr(trial_id, "interrupted", True)
+            self.study.tell(number, state=TrialState.FAIL)
 
     def _start(self, trial: optuna.Trial) -> None:
         """Submit a candidate's runs."""
@@ -254,7 +255,7 @@ class Driver:
 
 def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:
     """
-    Where a candidate's runs are: named after generation, slot and attempt, so that a trial that takes up its slot finds them.
+    Where a candidate's runs are: named after generation, slot and attempt, so that the next trial of a slot finds them.
 
     :param folder: Folder of the search
     :param trial: The trial

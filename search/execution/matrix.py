@@ -128,8 +128,9 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
             submission = in_flight.pop(cell)
             if submission.failure is not None and not is_finished(submission.folder):
                 failed.add(cell)
-                note = {"reason": submission.failure, "retry": True}
-                replace_text(submission.folder / FAILED, json.dumps(note) + "\n")
+                if not (submission.folder / FAILED).exists():  # its process could not write it
+                    note = {"reason": submission.failure, "retry": True}
+                    replace_text(submission.folder / FAILED, json.dumps(note) + "\n")
         left = len(waiting) + len(in_flight)
         over = n_waiting - left
         to_go = (time.monotonic() - started) / over * left if over else None
