@@ -4,4 +4,4 @@ from sb3_aarl.aux_loss import AuxLoss, search_space_size
 from sb3_aarl.sac_aux import SACAux
 
 __all__ = ["AuxLoss", "SACAux", "search_space_size"]
-__version__ = "0.1.0"
+__version__ = "0.2.0"

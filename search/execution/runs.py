@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sb3_aarl.callbacks import Evaluation, read_curve
+from search.training.provenance import provenance, read_about, write_about
 from search.training.run import CURVE, LOCKED, RUN, STOP, Run, is_finished, prepare_run, read_outcome
 
 logger = logging.getLogger(__name__)
@@ -157,6 +158,7 @@ class Submission:
 
     def _submit(self) -> None:
         prepare_run(self.folder, self.run)
+        write_about(self.folder, {**read_about(self.folder), "command": provenance()["command"]})
         self.future = self.executor.submit(start_run, str(self.folder))
 
     def stop(self) -> None:

@@ -90,9 +90,14 @@ def write_about(path: Path, about: Mapping[str, Any]) -> None:
 
 
 def add_session(path: Path, **session: Any) -> None:
-    """Add a session, in which a run is started or resumed, to its ``provenance.json``: values and :func:`provenance`."""
+    """
+    Add a session, in which a run is started or resumed, to its ``provenance.json``: values and :func:`provenance`. The
+    command is that of the program which submitted the run, if there is one.
+    """
     about = read_about(path)
-    write_about(path, {**about, "sessions": [*about.get("sessions", ()), {**provenance(), **session}]})
+    session = {**provenance(), **session}
+    session["command"] = about.get("command", session["command"])
+    write_about(path, {**about, "sessions": [*about.get("sessions", ()), session]})
 
 
 def save_result(path: Path, **result: Any) -> None:
