@@ -20,10 +20,10 @@ demo: $(VENV)/.installed
 	$(BIN)/aarl report runs/demo
 
 test: $(VENV)/.installed-dev system
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: lint system
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -30,3 +30,8 @@ def postgres() -> Iterator[Postgres]:
     server = Postgres(fsync="off")
     yield server
     server.close()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Slow tests first, so that two processes end at the same time."""
+    items.sort(key=lambda item: "slow" not in item.keywords)
