@@ -222,7 +222,7 @@ def test_a_second_process_waits_and_fails(tmp_path: Path, monkeypatch: pytest.Mo
     with FileLock(tmp_path / "lock"):
         with pytest.raises(Timeout):
             train(tmp_path)
-        with pytest.raises(SystemExit, match="lock"):
+        with pytest.raises(SystemExit, match=str(module.LOCKED)):
             run_program(tmp_path, monkeypatch)
     assert read_outcome(tmp_path) is None  # that of the first one will be there
     assert len(train(tmp_path)) == 2

@@ -216,7 +216,8 @@ def _key(values: Any, location: Sequence[str | int]) -> str:
         is_item = isinstance(part, int) and isinstance(values, Sequence)
         if is_item or (isinstance(values, Mapping) and (part in values or i + 1 == len(location))):
             key += f"[{part}]" if is_item else f".{part}" if key else str(part)
-            values = values[part] if is_item else values.get(part)  # type: ignore[index]
+            present = range(len(values)) if is_item else values
+            values = values[part] if part in present else None  # type: ignore[index]
     return key
 
 
