@@ -125,6 +125,7 @@ def test_the_returns_are_those_of_seeded_episodes_however_many_run_at_once(wrapp
         assert sum(walk.steps for walk in walks) == sum(steps for evaluation in expected for _, steps in evaluation)
 
 
+@pytest.mark.slow
 def test_on_dm_control_several_at_once_give_the_same_returns_bit_for_bit() -> None:
     """Apart from the rounding of matrix products, which is kept out here: each observation is predicted from alone."""
     kwargs = {"env_id": "cheetah-run", "action_repeat": 50}

@@ -273,6 +273,7 @@ def test_a_missing_extra_is_named(folder: Path, executor: Executor, monkeypatch:
     assert "pip install 'sb3-aarl[ray]'" in run("search", "small.yml", "--executor", "ray", code=2)
 
 
+@pytest.mark.slow
 def test_search_reports_progress_and_resumes(folder: Path, executor: Executor) -> None:
     write_search(folder, SMALLER)
     output = run("search", "small.yml", "--generations", 1, "--threads", 2, "--workers", 3)
@@ -285,6 +286,7 @@ def test_search_reports_progress_and_resumes(folder: Path, executor: Executor) -
     assert [trial.state for trial in study.trials] == [TrialState.COMPLETE] * 4
 
 
+@pytest.mark.slow
 def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray")
     write_search(folder, SMALLER)
@@ -294,6 +296,7 @@ def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Executor, mon
     assert executor.arguments == ("host:1", 2.0, 0.25) and len(executor.runs) == 2
 
 
+@pytest.mark.slow
 def test_a_search_in_which_all_fails_is_exit_code_1(folder: Path, executor: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder, SMALLER)
     monkeypatch.setattr("search.execution.driver.MAX_FAILURES", 2)

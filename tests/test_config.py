@@ -90,6 +90,7 @@ def test_small_searches_are_smaller(path: Path) -> None:
     assert max(small.checkpoints) <= max(whole.checkpoints) / 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cheetah_run_state", "cheetah_run_pixel"])  # the others have the same baselines
 def test_every_baseline_can_be_built(name: str) -> None:
     config = load_config(ZOO / "search" / f"{name}.yml")

@@ -138,6 +138,7 @@ def picture(env_id: str, **kwargs: Any) -> np.ndarray:
         env.close()
 
 
+@pytest.mark.slow
 def test_the_quadruped_is_seen_by_its_third_camera() -> None:
     usual = picture("quadruped-run")
     np.testing.assert_array_equal(usual, picture("quadruped-run", camera_id=2))

@@ -27,6 +27,8 @@ from search.training.run import prepare_run
 runner = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"})
 FIGURES = ("evolution", "histogram", "rankings", "patterns")
 
+pytestmark = pytest.mark.slow
+
 
 def run(*arguments: object, fails: bool = False) -> str:
     result = runner.invoke(app, [str(argument) for argument in arguments])

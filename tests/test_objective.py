@@ -40,6 +40,7 @@ def curve_of(folder: Path, seed: int = 0) -> list[Evaluation]:
     return read_curve(folder / f"candidates/trial-0/seed-{seed}/curve.csv")
 
 
+@pytest.mark.slow
 def test_the_curves_of_all_seeds_are_the_score_and_that_of_the_first_is_reported(tmp_path: Path) -> None:
     study = make_study()
     study.optimize(make_objective(tmp_path, seeds=(2, 5)), n_trials=1)

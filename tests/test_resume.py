@@ -168,6 +168,7 @@ def test_a_killed_run_ends_like_an_undisturbed_one(case: str, tmp_path: Path, pr
     assert not (folder / "checkpoint.pt").exists() and not (folder / "checkpoint.tmp").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_like_an_undisturbed_one(tmp_path: Path) -> None:
     """The same in one process, which has drawn other random numbers in between."""
 
@@ -184,6 +185,7 @@ def test_an_interrupted_run_ends_like_an_undisturbed_one(tmp_path: Path) -> None
     assert assert_same(one, other) > 40
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_run(tmp_path: Path) -> None:
     """Else the tests above would be content with a constant."""
     curves = []

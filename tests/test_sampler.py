@@ -277,6 +277,7 @@ def simulate_alone(screening: int) -> optuna.Study:
     return simulate(0, 1, screening=screening)
 
 
+@pytest.mark.slow
 @hypothesis_settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 9), st.sampled_from([1, 3]))
 def test_no_order_in_which_trials_finish_changes_a_loss(seed: int, n_running: int, screening: int) -> None:
@@ -304,6 +305,7 @@ def work(url: str, n_trials: int) -> None:
     study.optimize(lambda trial: score(suggest_aux_loss(trial, 1)), n_trials, callbacks=[stop])
 
 
+@pytest.mark.slow
 def test_a_search_resumes_from_a_file(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/study.db"
     for n_trials in (2, 3, 9):

@@ -210,6 +210,7 @@ MIXED = spaces.Dict(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extractor", ["multi_input", CombinedExtractor], ids=["multi_input", "SB3's"])
 def test_dict_observations(extractor: Any) -> None:
     arguments = {"cnn_output_dim": 8}
