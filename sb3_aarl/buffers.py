@@ -240,7 +240,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self.actions[pos] = action
         self.rewards[pos] = reward
         self.dones[pos] = done
-        self.timeouts[pos] = [self.handle_timeout_termination and info.get("TimeLimit.truncated", False) for info in infos]
+        # An array as in SB3: values may be arrays of one number.
+        truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+        self.timeouts[pos] = truncated if self.handle_timeout_termination else False
         self._last_next_obs = {key: value.copy() for key, value in following.items()}
         self._episode_over = np.zeros(self.n_envs, bool)
         self._count(self.n_added + 1)

@@ -351,6 +351,19 @@ def test_extend_and_reset_as_sb3_does():
     check_windows(ours, filled(ours, 13, LIFE, stack=2, padding="repeat"), 3)
 
 
+def test_is_extended_by_the_arrays_of_another_buffer():
+    """As SB3's own test does, with an array of one number for each time limit."""
+    source = make_buffer(20)
+    filled(source, 20, LIFE, stack=1, padding="repeat")
+    arrays = [source.observations, source.next_observations, source.actions, source.rewards, source.dones]
+    infos = [[{"TimeLimit.truncated": truncated}] for truncated in source.timeouts]
+    theirs, ours = ReplayBuffer(20, observation_space(1), ACTIONS, "cpu"), make_buffer(20)
+    for buffer in (theirs, ours):
+        buffer.extend(*arrays, infos)
+    assert_same_samples(ours, theirs)
+    np.testing.assert_array_equal(ours.timeouts, theirs.timeouts)
+
+
 def test_what_was_before_a_reset_is_gone_even_inside_of_an_episode():
     buffer = make_buffer(20)
     env = trajectory(0, [(30, "truncated")], 1, "repeat")
