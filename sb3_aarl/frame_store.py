@@ -243,7 +243,7 @@ def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
         try:
             stack = env.get_attr("stack_size")[0] if all(env.env_is_wrapped(FrameStackObservation)) else 1
         except (NotImplementedError, AttributeError):
-            stack = 1  # a VecEnv that does not report what it is made of
+            stack = 1  # env_is_wrapped is abstract in SB3, and VecEnvs of other packages do not all have it
     stacks = dict.fromkeys(parts, 1)
     for key, part in parts.items():
         shape = part.shape or (1,)

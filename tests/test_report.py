@@ -22,10 +22,10 @@ from selenium.webdriver.support.ui import WebDriverWait
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from sb3_aarl.callbacks import Evaluation, write_curve
 from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
-from search.execution.matrix import Cell, cell_folder
+from search.execution.matrix import Cell, cell_folder, stored_scores
 from search.results import analysis
 from search.results.notation import mathml
-from search.results.report import generation_table, stored_baselines, stored_runs, write_report
+from search.results.report import generation_table, stored_baselines, write_report
 from search.training.provenance import write_about
 from search.training.run import Run, prepare_run
 
@@ -241,7 +241,7 @@ def test_baselines_and_cross_validation_are_read_from_their_folders(tmp_path):
     for seed, score in ((0, 3.0), (1, 4.0), (2, None)):
         plant(tmp_path / "baselines", "SAC", "a", seed, score)
     assert stored_baselines(tmp_path) == [("SAC", 3.5)] and stored_baselines(tmp_path / "nothing") == []
-    validation = stored_runs(tmp_path / "cross-validation")
+    validation = stored_scores(tmp_path / "cross-validation")
     assert sorted(validation[["variant", "environment", "seed", "score"]].itertuples(index=False, name=None)) == sorted(
         runs[:-1]
     )
@@ -252,7 +252,7 @@ def test_baselines_and_cross_validation_are_read_from_their_folders(tmp_path):
     assert [row[0].endswith(loss) for row, loss in zip(rows, losses[1::-1], strict=True)] == [True, True]
     assert [row[1:] for row in rows] == [["10.5", "10.5", "10.5", "0.7", "4"], ["0.5", "0.5", "0.5", "0.7", "4"]]
     assert "1 without all runs are left out." in " ".join(page.text_content().split())
-    write_report(study, tmp_path / "report.html", validation=stored_runs(tmp_path / "nothing"))
+    write_report(study, tmp_path / "report.html", validation=stored_scores(tmp_path / "nothing"))
     assert "Cross-validation" not in read_page(tmp_path / "report.html").text_content()
 
 

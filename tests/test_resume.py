@@ -16,6 +16,7 @@ import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny import DENSE
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve
@@ -23,15 +24,7 @@ from search.training import checkpoint, run
 from search.training.checkpoint import TruncateAt, restart_seed
 from search.training.run import Run, prepare_run, train
 
-HYPER: dict[str, Any] = {
-    "env_kwargs": {},
-    "buffer_size": 1000,
-    "learning_starts": 20,
-    "batch_size": 16,
-    "predictor_width": 8,
-    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8, "width": 8}},
-    "device": "cpu",
-}
+HYPER: dict[str, Any] = {"env_kwargs": {}, **DENSE}
 PIXELS = {"pixels": True, "image_size": 16, "frame_stack": 2, "fast_rendering": True}
 CNN = {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8, "n_filters": 4}}
 # Episodes have 17, 25, 50 or up to 1000 agent steps: most are truncated at evaluations.

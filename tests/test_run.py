@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import VecNormalize
+from tiny import DENSE
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve
@@ -34,15 +35,6 @@ from search.training.run import (
     spread_checkpoints,
     train,
 )
-
-HYPER: dict[str, Any] = {
-    "buffer_size": 1000,
-    "learning_starts": 20,
-    "batch_size": 16,
-    "predictor_width": 8,
-    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8, "width": 8}},
-    "device": "cpu",
-}
 
 
 class Walk(gym.Env):
@@ -82,7 +74,7 @@ def make_run(**changes: Any) -> Run:
     values = {
         "environment": "Walk-v0",
         "aux_loss": "{s_t, a_t} -> {s_t+1}",
-        "hyperparameters": HYPER,
+        "hyperparameters": DENSE,
         "seed": 3,
         "checkpoints": (32, 64),
         "evaluation_episodes": 2,
@@ -104,9 +96,9 @@ def run_program(folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str) ->
     [
         ({"seed": 4}, "seed is 3 there, not 4"),
         ({"checkpoints": (32, 96)}, r"checkpoints is \[32, 64\] there, not \[32, 96\]"),
-        ({"hyperparameters": HYPER | {"batch_size": 8}}, "hyperparameters.batch_size is 16 there, not 8"),
-        ({"hyperparameters": HYPER | {"gamma": 0.9}}, "hyperparameters.gamma is None there, not 0.9"),
-        ({"hyperparameters": HYPER | {"policy_kwargs": {"net_arch": [9]}}}, "hyperparameters.policy_kwargs.net_arch"),
+        ({"hyperparameters": DENSE | {"batch_size": 8}}, "hyperparameters.batch_size is 16 there, not 8"),
+        ({"hyperparameters": DENSE | {"gamma": 0.9}}, "hyperparameters.gamma is None there, not 0.9"),
+        ({"hyperparameters": DENSE | {"policy_kwargs": {"net_arch": [9]}}}, "hyperparameters.policy_kwargs.net_arch"),
     ],
     ids=["seed", "checkpoints", "batch_size", "gamma", "nested"],
 )
@@ -120,7 +112,7 @@ def test_a_folder_of_another_run_is_refused(changes: dict[str, Any], key: str, t
 
 def test_the_device_may_change(tmp_path: Path) -> None:
     prepare_run(tmp_path, make_run())
-    prepare_run(tmp_path, make_run(hyperparameters=HYPER | {"device": "auto", "n_timesteps": 5000}))
+    prepare_run(tmp_path, make_run(hyperparameters=DENSE | {"device": "auto", "n_timesteps": 5000}))
     assert json.loads((tmp_path / "run.json").read_text())["hyperparameters"]["device"] == "auto"
 
 
@@ -148,7 +140,7 @@ def test_a_finished_run_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_the_model_is_kept_and_evaluated_as_documented(tmp_path: Path) -> None:
     """The last point of the curve, with one environment after the other."""
-    prepare_run(tmp_path, make_run(keep_model=True, hyperparameters=HYPER | {"gradient_steps": 0}))
+    prepare_run(tmp_path, make_run(keep_model=True, hyperparameters=DENSE | {"gradient_steps": 0}))
     curve = train(tmp_path)
     model = SACAux.load(tmp_path / "model.zip")
     env = make_env("Walk-v0", {})
@@ -312,7 +304,7 @@ def test_evaluations_are_normalized_like_training_without_changing_it(tmp_path: 
             made.append(self)
 
     monkeypatch.setattr(module, "VecNormalize", Watched)
-    prepare_run(tmp_path, make_run(hyperparameters=HYPER | {"normalize": {"clip_obs": 5.0}, "gamma": 0.9}))
+    prepare_run(tmp_path, make_run(hyperparameters=DENSE | {"normalize": {"clip_obs": 5.0}, "gamma": 0.9}))
     train(tmp_path)
     training, evaluation = made
     assert training.training and training.norm_reward and training.clip_obs == evaluation.clip_obs == 5.0
@@ -325,7 +317,7 @@ def test_the_replay_buffer_is_no_larger_than_the_run(tmp_path: Path, monkeypatch
     sizes: list[int] = []
     monkeypatch.setattr(SACAux, "learn", lambda self, *_, **__: sizes.append(self.replay_buffer.buffer_size) or 1 / 0)
     for n_envs, size in ((1, 64), (2, 32)):
-        prepare_run(tmp_path / str(n_envs), make_run(hyperparameters=HYPER | {"n_envs": n_envs}))
+        prepare_run(tmp_path / str(n_envs), make_run(hyperparameters=DENSE | {"n_envs": n_envs}))
         with pytest.raises(ZeroDivisionError):
             train(tmp_path / str(n_envs))
         assert sizes[-1] == size
@@ -335,7 +327,7 @@ def test_the_replay_buffer_is_no_larger_than_the_run(tmp_path: Path, monkeypatch
 def test_environments_in_processes_are_the_same(tmp_path: Path) -> None:
     curves = []
     for vec_env in ("dummy", "subproc"):
-        run = make_run(environment="Pendulum-v1", hyperparameters=HYPER | {"vec_env": vec_env}, checkpoints=(30, 60))
+        run = make_run(environment="Pendulum-v1", hyperparameters=DENSE | {"vec_env": vec_env}, checkpoints=(30, 60))
         prepare_run(tmp_path / vec_env, run)
         curves.append([point[:4] for point in train(tmp_path / vec_env)])
     assert curves[0] == curves[1]
@@ -350,14 +342,14 @@ def test_environments_in_processes_are_the_same(tmp_path: Path) -> None:
         ({"environment": "CartPole-v1"}, r"CartPole-v1 cannot be trained with these settings: .*Box"),
         ({"environment": "Walk-v7"}, "Walk-v7 cannot be trained with these settings: .*Walk"),
         ({"imports": ("no_such_module",)}, "no_such_module"),
-        ({"hyperparameters": HYPER | {"batch_size": 0}}, "batch_size must be at least 1"),
-        ({"hyperparameters": HYPER | {"batch_sise": 1}}, "batch_sise"),
+        ({"hyperparameters": DENSE | {"batch_size": 0}}, "batch_size must be at least 1"),
+        ({"hyperparameters": DENSE | {"batch_sise": 1}}, "batch_sise"),
         (
-            {"hyperparameters": HYPER | {"train_freq": 3, "n_envs": 2}},
+            {"hyperparameters": DENSE | {"train_freq": 3, "n_envs": 2}},
             "checkpoint 32 is no multiple of .* 6 environment steps",
         ),
-        ({"hyperparameters": HYPER | {"env_kwargs": {"action_repeat": 5}}}, "checkpoint 32 is no multiple of .* 5 env"),
-        ({"hyperparameters": HYPER | {"train_freq": [2, "episode"]}}, "train_freq"),
+        ({"hyperparameters": DENSE | {"env_kwargs": {"action_repeat": 5}}}, "checkpoint 32 is no multiple of .* 5 env"),
+        ({"hyperparameters": DENSE | {"train_freq": [2, "episode"]}}, "train_freq"),
     ],
     ids=["discrete", "unknown", "import", "value", "key", "rollout", "repeat", "episodes"],
 )
@@ -373,7 +365,7 @@ def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None
 def test_evaluations_closer_than_an_episode(
     checkpoints: tuple[int, ...], n_envs: int, n_warnings: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    check_run(make_run(checkpoints=checkpoints, hyperparameters=HYPER | {"n_envs": n_envs}))
+    check_run(make_run(checkpoints=checkpoints, hyperparameters=DENSE | {"n_envs": n_envs}))
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(warnings) == n_warnings and all("truncate" in warning for warning in warnings)
 

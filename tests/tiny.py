@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from search.training.run import Run
 
 HYPERPARAMETERS: dict[str, Any] = {
@@ -12,14 +14,16 @@ HYPERPARAMETERS: dict[str, Any] = {
     "predictor_width": 8,
     "policy_kwargs": {"net_arch": [8], "features_extractor_class": "mlp", "features_extractor_kwargs": {"features_dim": 4}},
 }
-YAML = """\
-default:
-  policy: MlpPolicy
-  learning_starts: 40
-  batch_size: 8
-  predictor_width: 8
-  policy_kwargs: {net_arch: [8], features_extractor_class: mlp, features_extractor_kwargs: {features_dim: 4}}
-"""
+YAML = yaml.safe_dump({"default": HYPERPARAMETERS})
+# With the default encoder, and a checkpoint that is small.
+DENSE: dict[str, Any] = {
+    "buffer_size": 1000,
+    "learning_starts": 20,
+    "batch_size": 16,
+    "predictor_width": 8,
+    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8, "width": 8}},
+    "device": "cpu",
+}
 SEARCH = """\
 environment: Pendulum-v1
 hyperparameters: hyperparameters.yml

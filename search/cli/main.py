@@ -45,7 +45,7 @@ def explain(error: Exception) -> str | None:
         from sqlalchemy.exc import SQLAlchemyError
 
         from search.execution.runs import RunFailed
-        from search.execution.storage import hide_password
+        from search.training.provenance import hide_password
 
         kinds += [RunFailed, StorageInternalError, SQLAlchemyError]
         line = hide_password(line)

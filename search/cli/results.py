@@ -134,11 +134,12 @@ def report(
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
     """Write a report of a search as one HTML file."""
-    from search.results.report import stored_baselines, stored_runs, write_report
+    from search.execution.matrix import stored_scores
+    from search.results.report import stored_baselines, write_report
 
     ((searched, path),) = open_studies([folder], storage).values()
     out = out or path / "report.html"
-    write_report(searched, out, stored_baselines(path), stored_runs(path / "cross-validation"), benchmark)
+    write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"), benchmark)
     say(f"Report: {out}")
 
 

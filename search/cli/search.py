@@ -57,10 +57,11 @@ def search(
 
     from search.execution.driver import Driver
     from search.execution.runs import LocalExecutor
-    from search.execution.storage import hide_password, open_storage
+    from search.execution.storage import open_storage
     from search.results.dashboard import update_plots
     from search.results.report import stored_baselines
     from search.studies.search import open_search, runs_of
+    from search.training.provenance import hide_password
 
     logging.set_verbosity(logging.WARNING)
     settings = read_config(config, threads=threads, generations=generations, pruner=pruner)

@@ -19,9 +19,9 @@ from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation, aulc
 from search.evolution.sampler import AuxLossSampler, GenerationProgress
 from search.evolution.space import loss_of, suggest_aux_loss
-from search.execution.runs import Executor, RunFailed, Submission, mean_curve, partial_curve
+from search.execution.runs import Executor, RunFailed, Submission, mean_curve
 from search.training.provenance import commit, read_about, versions
-from search.training.run import Run
+from search.training.run import Run, partial_curve
 
 logger = logging.getLogger(__name__)
 

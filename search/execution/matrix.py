@@ -14,9 +14,9 @@ import pandas as pd
 
 from sb3_aarl.callbacks import aulc, replace_text
 from sb3_aarl.envs import PREFIX
-from search.execution.runs import Executor, Submission, partial_curve
-from search.training.provenance import read_about, write_about
-from search.training.run import FAILED, Run, is_finished, prepare_run, read_outcome
+from search.execution.runs import Executor, Submission
+from search.training.provenance import ABOUT, read_about, write_about
+from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run, read_outcome
 
 POLL_SECONDS = 0.5
 
@@ -148,12 +148,22 @@ def scores(matrix: Matrix) -> pd.DataFrame:
 
     :param matrix: The runs
     """
-    rows = []
-    for cell in matrix.runs:
-        path = cell_folder(matrix.folder, cell)
-        if is_finished(path):
-            curve = partial_curve(path)
-            rows.append({**cell._asdict(), "score": aulc(curve), "last": curve[-1].mean})
+    return _scores((cell, cell_folder(matrix.folder, cell)) for cell in matrix.runs)
+
+
+def stored_scores(folder: Path) -> pd.DataFrame:
+    """
+    The same of all runs in the folder of a matrix, read without its configuration; none if the folder is not there.
+
+    :param folder: Folder of the matrix
+    """
+    abouts = {file.parent: read_about(file.parent) for file in sorted(folder.glob(f"*/*/*/{ABOUT}"))}
+    return _scores((Cell(*(about[name] for name in Cell._fields)), path) for path, about in abouts.items())
+
+
+def _scores(runs: Iterable[tuple[Cell, Path]]) -> pd.DataFrame:
+    curves = [(cell, partial_curve(path)) for cell, path in runs if is_finished(path)]
+    rows = [(*cell, aulc(curve), curve[-1].mean) for cell, curve in curves]
     return pd.DataFrame(rows, columns=[*Cell._fields, "score", "last"])
 
 

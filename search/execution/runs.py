@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sb3_aarl.callbacks import Evaluation, read_curve
+from sb3_aarl.callbacks import Evaluation
 from search.training.provenance import provenance, read_about, write_about
-from search.training.run import CURVE, LOCKED, RUN, STOP, Run, is_finished, prepare_run, read_outcome
+from search.training.run import LOCKED, STOP, Outcome, Run, is_finished, partial_curve, prepare_run, read_outcome, read_run
 
 logger = logging.getLogger(__name__)
 
@@ -55,18 +55,17 @@ def start_run(folder: str) -> dict[str, Any]:
         code = _train(path)
         if code != LOCKED:  # another process trains it, such as one that outlived its driver: its outcome is waited for
             break
-    if code and read_outcome(path) is None:
-        how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        return {"curve": _rows(path), "failure": f"the run's process was killed ({how}), see {path / OUTPUT}", "retry": True}
     outcome = read_outcome(path)
-    if outcome is None:  # it was told to stop
-        return {"curve": _rows(path), "failure": None, "retry": False}
+    if outcome is None:  # it was killed, or told to stop
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        failure = f"the run's process was killed ({how}), see {path / OUTPUT}" if code else None
+        outcome = Outcome(partial_curve(path), failure, retry=bool(code))
     return {"curve": [list(row) for row in outcome.curve], "failure": outcome.failure, "retry": outcome.retry}
 
 
 def _train(folder: Path) -> int:
     """Train a run in a process, whose exit code is returned."""
-    threads = Run.model_validate_json((folder / RUN).read_text(encoding="utf-8")).threads
+    threads = read_run(folder).threads
     command = [sys.executable, "-m", "search.training.run", str(folder), "--end-with-stdin"]
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     # A session of its own: Ctrl-C reaches the driver only, whose end closes the pipe.
@@ -82,20 +81,6 @@ def _train(folder: Path) -> int:
             if executor.is_closed:
                 process.kill()
         return process.wait()
-
-
-def _rows(folder: Path) -> list[list[float]]:
-    return [list(row) for row in partial_curve(folder)]
-
-
-def partial_curve(folder: Path) -> list[Evaluation]:
-    """
-    The learning curve of a run so far.
-
-    :param folder: Folder of the run
-    """
-    path = folder / CURVE
-    return read_curve(path) if path.exists() else []
 
 
 def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:

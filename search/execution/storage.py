@@ -1,6 +1,5 @@
 """Where a search keeps its study: SQLite in its folder, or any database that Optuna knows."""
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +49,3 @@ def load_study(storage: RDBStorage, name: str | None = None) -> optuna.Study:
         wanted = "which study?" if name is None else f"there is no study {name!r}."
         raise ValueError(f"{wanted} The storage has: {', '.join(names) or 'none'}")
     return optuna.load_study(study_name=name, storage=storage)
-
-
-def hide_password(text: str) -> str:
-    """
-    A text that may hold the URL of a database, without its password.
-
-    :param text: Such as an error message
-    """
-    return re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", text)

@@ -19,8 +19,8 @@ from rich.table import Table
 from rich.text import Text
 
 from sb3_aarl.aux_loss import AuxLoss
-from sb3_aarl.callbacks import aulc, read_curve, replace_text
-from search.execution.matrix import Cell, comparable, task_name
+from sb3_aarl.callbacks import replace_text
+from search.execution.matrix import comparable, stored_scores, task_name
 from search.results import analysis
 from search.results import table as tables
 from search.results.notation import mathml
@@ -29,29 +29,15 @@ from search.results.trials import lineage, ranked
 from search.studies import cross_validation
 from search.studies.benchmark import read_curves
 from search.studies.search import SETTINGS_KEY
-from search.training.provenance import ABOUT, provenance, read_about
-from search.training.run import is_finished
+from search.training.provenance import provenance
 
 N_BEST = 10
 N_IMPORTANCES = 12
 
 
-def stored_runs(folder: Path) -> pd.DataFrame:
-    """
-    The finished runs of a matrix, such as the baselines or the cross-validation of a search, read from its folder without
-    its configuration: one row each, as returned by :func:`search.execution.matrix.scores`; none if the folder is not there.
-    """
-    rows = []
-    for path in sorted(file.parent for file in folder.glob(f"*/*/*/{ABOUT}")):
-        if is_finished(path):
-            about, curve = read_about(path), read_curve(path / "curve.csv")
-            rows.append((*(about[name] for name in Cell._fields), aulc(curve), curve[-1].mean))
-    return pd.DataFrame(rows, columns=[*Cell._fields, "score", "last"])
-
-
 def stored_baselines(folder: Path) -> list[tuple[str, float]]:
     """Name and mean score of the baselines that have finished runs, from the folder of a search."""
-    means = stored_runs(folder / "baselines").groupby("variant")["score"].mean()
+    means = stored_scores(folder / "baselines").groupby("variant")["score"].mean()
     return [(str(name), float(score)) for name, score in means.items()]
 
 
@@ -80,7 +66,7 @@ def write_report(
     :param study: The study
     :param path: Where the HTML file goes; its folder is made if it is not there
     :param baselines: Names and scores to compare with
-    :param validation: Runs of the cross-validation, as returned by :func:`stored_runs`
+    :param validation: Runs of the cross-validation, as returned by :func:`search.execution.matrix.stored_scores`
     :param benchmark: Folder of a benchmark whose tables and learning curves are shown too
     """
     trials = study.get_trials(deepcopy=False)

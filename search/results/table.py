@@ -13,13 +13,12 @@ import yaml
 from rich.markup import escape
 from rich.table import Table
 
-from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search.execution.matrix import comparable, task_name
 from search.results.statistics import SUITE, improvements, interquartile_means
 from search.studies import operator_selection
 from search.studies.benchmark import read_abouts
-from search.training.run import FAILED
+from search.training.run import FAILED, partial_curve
 
 # A difference is marked from so many standard errors on.
 STANDARD_ERRORS = 2.0
@@ -79,8 +78,7 @@ def read_runs(folder: Path) -> pd.DataFrame:
     """
     rows: list[tuple[Any, ...]] = []
     for path, about in read_abouts(folder).items():
-        curve = read_curve(path / "curve.csv") if (path / "curve.csv").exists() else []
-        returns = {point.environment_steps: point.mean for point in curve}
+        returns = {point.environment_steps: point.mean for point in partial_curve(path)}
         commits, versions = (
             ", ".join(dict.fromkeys(session.get(key, "") for session in about["sessions"])) for key in ("commit", "versions")
         )

@@ -10,18 +10,15 @@ from typing import Any
 import pandas as pd
 
 from sb3_aarl import catalog
-from sb3_aarl.callbacks import read_curve
 from sb3_aarl.envs import PREFIX
 from search.execution.matrix import Cell, Matrix, all_cells, task_name
 from search.training.config import ConfigError, action_repeat, load_hyperparameters, read_yaml, resolve_env_id
 from search.training.provenance import ABOUT, read_about
-from search.training.run import Run, check_run, checkpoint_interval, differences
+from search.training.run import FREE, Run, check_run, checkpoint_interval, differences, partial_curve
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
 UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
-# Settings that change no score.
-SCORELESS = ("n_timesteps", "device")
 
 
 def load_benchmark(
@@ -124,8 +121,7 @@ def read_curves(folder: Path) -> pd.DataFrame:
     rows = [
         (about["variant"], task_name(about["environment"]), about["seed"], point.environment_steps, point.mean, point.std)
         for path, about in read_abouts(folder).items()
-        if (path / "curve.csv").exists()
-        for point in read_curve(path / "curve.csv")
+        for point in partial_curve(path)
     ]
     if not rows:
         raise ValueError(f"{folder} has no learning curves of a benchmark")
@@ -207,7 +203,7 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any], *keys: str) ->
     # Runs that were trained by another program name it.
     keys = (*keys, "evaluation_episodes", "program")
     old, new = ({key: about.get(key) for key in keys} | about.get("hyperparameters", {}) for about in (one, other))
-    return next((found for found in differences(old, new) if found[0] not in SCORELESS), None)
+    return next((found for found in differences(old, new) if found[0] not in FREE), None)
 
 
 def _check_models(matrix: Matrix) -> None:

@@ -6,13 +6,12 @@ from pathlib import Path
 import optuna
 import pandas as pd
 import yaml
-from optuna.study import StudyDirection
-from optuna.trial import TrialState
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
 from search.evolution.space import loss_of
 from search.execution.matrix import Cell, Matrix
+from search.results.trials import ranked
 from search.studies.config import SearchConfig
 from search.studies.search import make_run
 from search.training.config import ConfigError
@@ -26,8 +25,7 @@ def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
 
     :raises ValueError: when no candidate is complete
     """
-    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    trials.sort(key=lambda trial: trial.value or 0.0, reverse=study.direction == StudyDirection.MAXIMIZE)
+    trials = ranked(study.get_trials(deepcopy=False), study.direction)
     losses = dict.fromkeys(loss.canonical() for loss in map(loss_of, trials) if loss is not None)
     if not losses:
         raise ValueError(f"study {study.study_name!r} has no completed candidate yet")

@@ -16,11 +16,11 @@ from sb3_aarl.aux_loss import AuxLoss
 from search.evolution.sampler import AuxLossSampler
 from search.execution.matrix import Cell, Matrix
 from search.studies.config import SearchConfig
-from search.training.run import Run, differences
+from search.training.run import FREE, Run, differences
 
 SETTINGS_KEY = "settings"  # user attribute of a study
-# Settings that may change when a search is resumed.
-FREE = ("n_timesteps", "device", "n_generations", "pruner")
+# Settings that may change when a search is resumed, beside those of its runs.
+FREE_OF_SEARCH = ("n_generations", "pruner")
 
 
 def make_run(
@@ -112,6 +112,6 @@ def _difference(study: optuna.Study, config: SearchConfig) -> str | None:
         has_trials = any(trial.state != TrialState.WAITING for trial in study.get_trials(deepcopy=False))
         return "it has trials of another program" if has_trials else None
     for key, old, new in differences(stored, wanted):
-        if key not in FREE:
+        if key not in FREE + FREE_OF_SEARCH:
             return f"it was started with {key}={old!r}, not {new!r}"
     return None

@@ -63,13 +63,22 @@ def versions() -> str:
     return ", ".join(found)
 
 
+def hide_password(text: str) -> str:
+    """
+    A text that may hold the URL of a database, without its password.
+
+    :param text: Such as an error message
+    """
+    return re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", text)
+
+
 def provenance() -> dict[str, str]:
     """Commit, command, date, hardware and versions: they belong beside every result."""
     name = Path(sys.argv[0]).name
     command = " ".join(["aarl" if name == "main.py" else name, *sys.argv[1:]])  # main.py: python -m search.cli.main
     return {
         "commit": commit(),
-        "command": re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", command),  # passwords in URLs
+        "command": hide_password(command),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "cpu": cpu(),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else "none",

@@ -89,7 +89,7 @@ def prepare_run(folder: Path, run: Run) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     values = run.model_dump(mode="json")
     if (folder / RUN).exists():
-        stored = _read_run(folder).model_dump(mode="json")
+        stored = read_run(folder).model_dump(mode="json")
         for key, ours, theirs in differences(values, stored):
             if key not in [f"hyperparameters.{name}" for name in FREE]:
                 raise ValueError(f"{folder} has another run: {key} is {theirs!r} there, not {ours!r}. Choose another folder")
@@ -100,7 +100,7 @@ def prepare_run(folder: Path, run: Run) -> None:
 
 def read_outcome(folder: Path) -> Outcome | None:
     """How a run ended, None as long as it did not: it runs, waits, or was killed or told to stop."""
-    curve = read_curve(folder / CURVE) if (folder / CURVE).exists() else []
+    curve = partial_curve(folder)
     if is_finished(folder):
         return Outcome(curve, None, False)
     if not (folder / FAILED).exists():
@@ -109,16 +109,22 @@ def read_outcome(folder: Path) -> Outcome | None:
     return Outcome(curve, failed["reason"], failed["retry"])
 
 
+def partial_curve(folder: Path) -> list[Evaluation]:
+    """The learning curve of a run so far."""
+    return read_curve(folder / CURVE) if (folder / CURVE).exists() else []
+
+
 def is_finished(folder: Path) -> bool:
     """Whether a run has its complete curve, and its model if that is kept."""
-    if not (folder / RUN).exists() or not (folder / CURVE).exists():
+    if not (folder / RUN).exists():
         return False
-    run = _read_run(folder)
-    steps = tuple(evaluation.environment_steps for evaluation in read_curve(folder / CURVE))
+    run = read_run(folder)
+    steps = tuple(evaluation.environment_steps for evaluation in partial_curve(folder))
     return steps == run.checkpoints and (not run.keep_model or (folder / MODEL).exists())
 
 
-def _read_run(folder: Path) -> Run:
+def read_run(folder: Path) -> Run:
+    """The run of a folder."""
     path = folder / RUN
     return validated(Run, json.loads(path.read_text(encoding="utf-8")), str(path))
 
@@ -272,7 +278,7 @@ def train(
         if not is_finished(folder):
             (folder / FAILED).unlink(missing_ok=True)
             try:
-                _train(folder, _read_run(folder), progress_bar, on_evaluation)
+                _train(folder, read_run(folder), progress_bar, on_evaluation)
             except FloatingPointError:  # and so it would be from the checkpoint on
                 checkpoint.remove(folder)
                 raise
