@@ -53,7 +53,7 @@ def test_adding_generation_by_generation_equals_adding_at_once() -> None:
     for part in (slice(0, 1), slice(1, 125), slice(125, 225), slice(225, 325)):
         stepwise.add(losses[part], list(scores[part]))
     at_once.add(losses, list(scores))
-    assert len(stepwise.scores) == len(at_once.scores) == 325
+    assert stepwise.n_trials == at_once.n_trials == 325
     np.testing.assert_allclose(stepwise.mean, at_once.mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(stepwise.root, at_once.root, rtol=0, atol=1e-9)
 
@@ -74,7 +74,7 @@ def test_scores_that_are_not_finite_or_cannot_be_squared_are_skipped() -> None:
     model.add(losses[:40], list(scores[:40]))
     other.add(losses, [*scores[:40], *[np.nan, np.inf, -sys.float_info.max] * 3, np.nan])
     other.add(losses[:1], [np.inf])
-    assert len(other.scores) == 40
+    assert other.n_trials == 40
     np.testing.assert_array_equal(model.mean, other.mean)
 
 
