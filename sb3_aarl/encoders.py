@@ -10,24 +10,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 
-
-def orthogonal_init(module: nn.Module) -> None:
-    """
-    Orthogonal linear layers and delta-orthogonal convolutions, biases zero, as in CURL; for ``Module.apply``.
-
-    Delta-orthogonal: all taps of a kernel are zero but the middle one, which is orthogonal across channels.
-
-    :param module: A layer; what is neither linear nor convolutional stays as it is
-    """
-    if isinstance(module, nn.Linear):
-        nn.init.orthogonal_(module.weight)
-    elif isinstance(module, nn.Conv2d):
-        nn.init.zeros_(module.weight)
-        middle = module.weight[:, :, module.kernel_size[0] // 2, module.kernel_size[1] // 2]
-        with th.no_grad():
-            middle.copy_(nn.init.orthogonal_(th.empty_like(middle), nn.init.calculate_gain("relu")))
-    if isinstance(module, (nn.Linear, nn.Conv2d)) and module.bias is not None:
-        nn.init.zeros_(module.bias)
+from sb3_aarl.networks import SimbaBlock, orthogonal_init
 
 
 def flat(observations: th.Tensor) -> th.Tensor:
@@ -192,24 +175,11 @@ class RunningNorm(nn.Module):
         return (x - self.running_mean) / (self.running_var + 1e-5).sqrt()
 
 
-class SimbaBlock(nn.Module):
-    """
-    Residual block of SimBa (Lee et al., 2024): layer norm, a ReLU layer four times as wide, a projection back.
-
-    :param width: Width of input and output
-    """
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.layers = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.ReLU(), nn.Linear(4 * width, width))
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        return x + self.layers(x)
-
-
-class SimbaEncoder(BaseFeaturesExtractor):
+class SimbaEncoder(Encoder):
     """
     Encoder in the manner of SimBa (Lee et al., 2024): running normalisation, a linear layer, residual blocks, layer norm.
+
+    All of it is the trunk, which the actor reads through a projection of its own; the latent state is the trunk's output.
 
     :param observation_space: Any space that SB3 can flatten
     :param features_dim: Width of the latent state and of all blocks
@@ -218,20 +188,28 @@ class SimbaEncoder(BaseFeaturesExtractor):
     """
 
     def __init__(self, observation_space: spaces.Space, features_dim: int = 128, n_blocks: int = 1, normalize: bool = True):
-        super().__init__(observation_space, features_dim)
+        super().__init__(observation_space, features_dim, trunk_dim=features_dim)
         inputs = get_flattened_obs_dim(observation_space)
         self.normalization: nn.Module = RunningNorm(inputs) if normalize else nn.Identity()
         blocks = [SimbaBlock(features_dim) for _ in range(n_blocks)]
         self.layers = nn.Sequential(nn.Linear(inputs, features_dim), *blocks, nn.LayerNorm(features_dim))
         self.layers.apply(orthogonal_init)
+        self.projection = nn.Sequential()
 
-    def forward(self, observations: th.Tensor) -> th.Tensor:
+    def trunk(self, observations: th.Tensor) -> th.Tensor:
         return self.layers(self.normalization(flat(observations)))
+
+
+VECTOR_ENCODERS: Mapping[str, type[DenseMLP] | type[SimbaEncoder]] = {
+    "dense_mlp": DenseMLP,
+    "mlp": MLP,
+    "simba": SimbaEncoder,
+}
 
 
 class MultiInputEncoder(Encoder):
     """
-    For Dict observations: a PixelEncoder for each image, one DenseMLP for all other keys together.
+    For Dict observations: a PixelEncoder for each image, one encoder for all other keys together.
 
     Each part projects its own trunk; ``make_projection`` returns one projection of all trunks, for the actor.
 
@@ -239,6 +217,7 @@ class MultiInputEncoder(Encoder):
     :param cnn_output_dim: Width of each image's latent state (table 7: 50; the name is SB3's CombinedExtractor's)
     :param mlp_output_dim: Width of the other keys' latent state (table 8: 40)
     :param normalized_image: Whether images are floats already, as in SB3's CombinedExtractor
+    :param vector_encoder: Encoder of the other keys: ``"dense_mlp"``, ``"mlp"`` or ``"simba"``
     """
 
     def __init__(
@@ -247,6 +226,7 @@ class MultiInputEncoder(Encoder):
         cnn_output_dim: int = 50,
         mlp_output_dim: int = 40,
         normalized_image: bool = False,
+        vector_encoder: str = "dense_mlp",
     ):
         images: dict[str, spaces.Space] = {}
         vectors: dict[str, spaces.Space] = {}
@@ -257,7 +237,7 @@ class MultiInputEncoder(Encoder):
             key: PixelEncoder(space, cnn_output_dim) for key, space in images.items() if isinstance(space, spaces.Box)
         }
         if vectors:
-            encoders["vectors"] = DenseMLP(spaces.Dict(vectors), mlp_output_dim)
+            encoders["vectors"] = VECTOR_ENCODERS[vector_encoder](spaces.Dict(vectors), mlp_output_dim)
         super().__init__(
             observation_space,
             sum(encoder.features_dim for encoder in encoders.values()),
@@ -285,9 +265,7 @@ class MultiInputEncoder(Encoder):
 # The names that plain YAML uses for features_extractor_class.
 ENCODERS: Mapping[str, type[BaseFeaturesExtractor]] = {
     "pixel": PixelEncoder,
-    "dense_mlp": DenseMLP,
-    "mlp": MLP,
-    "simba": SimbaEncoder,
+    **VECTOR_ENCODERS,
     "multi_input": MultiInputEncoder,
     "identity": FlattenExtractor,
 }

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeGuard
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import get_action_dim, is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor as SB3Actor
@@ -16,7 +16,8 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 from sb3_aarl.augmentation import center_crop, image_spaces, random_crop, random_shift
-from sb3_aarl.encoders import DenseMLP, Encoder, MultiInputEncoder, PixelEncoder, encoder_class, orthogonal_init
+from sb3_aarl.encoders import DenseMLP, Encoder, MultiInputEncoder, PixelEncoder, encoder_class
+from sb3_aarl.networks import hidden_layers, orthogonal_init
 
 AUGMENTATIONS = ("auto", "random_crop", "random_shift", "none")
 CROP_SIZE = 84  # paper, table 7
@@ -112,6 +113,7 @@ class Actor(_CropsImages, SB3Actor):
     :param crop_size: Height and width in pixels that images are cropped to, None for no crop
     :param squash_log_std: None for SB3's clipping of the log standard deviation to [-20, 2]; bounds such as (-10, 2)
         for tanh squashing into them
+    :param network: Kind of its hidden layers, see ``networks.hidden_layers``
     :param kwargs: Those of SB3's actor
     """
 
@@ -121,9 +123,13 @@ class Actor(_CropsImages, SB3Actor):
         share_features_extractor: bool = False,
         crop_size: int | None = None,
         squash_log_std: tuple[float, float] | None = None,
+        network: str = "mlp",
         **kwargs: Any,
     ):
         super().__init__(*args, **kwargs)
+        self.network = network
+        if network != "mlp":
+            self.latent_pi = hidden_layers(network, self.features_dim, self.net_arch, self.activation_fn)
         self.share_features_extractor = share_features_extractor
         self.crop_size = crop_size
         self.squash_log_std = squash_log_std
@@ -142,6 +148,7 @@ class Actor(_CropsImages, SB3Actor):
             "share_features_extractor": self.share_features_extractor,
             "crop_size": self.crop_size,
             "squash_log_std": self.squash_log_std,
+            "network": self.network,
         }
 
     def own_parameters(self) -> list[nn.Parameter]:
@@ -179,12 +186,20 @@ class Critic(_CropsImages, ContinuousCritic):
     SB3's critic around the encoder that the critic loss and the auxiliary loss train.
 
     :param crop_size: Height and width in pixels that images are cropped to, None for no crop
+    :param network: Kind of its hidden layers, see ``networks.hidden_layers``
     :param kwargs: Those of SB3's critic
     """
 
-    def __init__(self, *args: Any, crop_size: int | None = None, **kwargs: Any):
+    def __init__(self, *args: Any, crop_size: int | None = None, network: str = "mlp", **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.crop_size = crop_size
+        if network != "mlp":
+            for i, q_network in enumerate(self.q_networks):
+                assert isinstance(q_network, nn.Sequential)
+                inputs = kwargs["features_dim"] + get_action_dim(self.action_space)
+                hidden = hidden_layers(network, inputs, kwargs["net_arch"], kwargs["activation_fn"])
+                self.q_networks[i] = nn.Sequential(*hidden, q_network[-1])
+                setattr(self, f"qf{i}", self.q_networks[i])
 
     def trunk(self, obs: PyTorchObs) -> Trunk:
         """
@@ -240,6 +255,9 @@ class SACAuxPolicy(SACPolicy):
         (-10, 2) (the public reference): tanh squashes it into them; gSDE ignores them
     :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases
         (CURL, the reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
+    :param network: Kind of the hidden layers of actor and critic: ``"mlp"`` (default, SB3), ``"layer_norm"`` (before each
+        activation) or ``"simba"`` (a residual block for each width of ``net_arch``); as with ``net_arch``, a dict such as
+        ``dict(pi="mlp", qf="layer_norm")`` where they differ
     :param kwargs: activation_fn, use_sde, log_std_init, use_expln, clip_mean, normalize_images, optimizer_class,
         optimizer_kwargs and n_critics of SB3's SACPolicy
     """
@@ -263,6 +281,7 @@ class SACAuxPolicy(SACPolicy):
         crop_size: int | None = None,
         squash_log_std: tuple[float, float] | None = None,
         ortho_init: bool = False,
+        network: str | dict[str, str] = "mlp",
         **kwargs: Any,
     ):
         normalize_images = kwargs.get("normalize_images", True)
@@ -271,6 +290,7 @@ class SACAuxPolicy(SACPolicy):
         self.crop_size = CROP_SIZE if crop_size is None else crop_size
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
+        self.network = network
         encoder = encoder_class(features_extractor_class or self.default_encoder)
         if issubclass(encoder, MultiInputEncoder) and not normalize_images:
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
@@ -345,13 +365,18 @@ class SACAuxPolicy(SACPolicy):
             share_features_extractor=self.share_features_extractor,
             crop_size=self.crop_size if self.crops else None,
             squash_log_std=self.squash_log_std,
+            network=self.network if isinstance(self.network, str) else self.network["pi"],
         ).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         # To SB3 "shared" means that the critic does not train the encoder. Here it always does.
         kwargs["share_features_extractor"] = False
-        return Critic(**kwargs, crop_size=self.crop_size if self.crops else None).to(self.device)
+        return Critic(
+            **kwargs,
+            crop_size=self.crop_size if self.crops else None,
+            network=self.network if isinstance(self.network, str) else self.network["qf"],
+        ).to(self.device)
 
     def augment(self, obs: PyTorchObs) -> PyTorchObs:
         """
@@ -376,6 +401,7 @@ class SACAuxPolicy(SACPolicy):
             "crop_size": self.crop_size,
             "squash_log_std": self.squash_log_std,
             "ortho_init": self.ortho_init,
+            "network": self.network,
         }
 
 

@@ -165,7 +165,10 @@ def test_mlps_against_a_naive_forward_pass(cls: type[DenseMLP], shape: tuple[int
     [["camera", "wrist", "speed", "mode", "joints"], ["camera"], ["speed", "joints"]],
     ids=["both", "images only", "vectors only"],
 )
-def test_multi_input_encoder_is_its_parts_side_by_side(keys: list[str]) -> None:
+@pytest.mark.parametrize(("name", "vector_encoder"), [("dense_mlp", DenseMLP), ("simba", SimbaEncoder)])
+def test_multi_input_encoder_is_its_parts_side_by_side(
+    keys: list[str], name: str, vector_encoder: type[BaseFeaturesExtractor]
+) -> None:
     everything = {
         "speed": vectors(3),
         "camera": images(3, 15, 16),
@@ -174,7 +177,7 @@ def test_multi_input_encoder_is_its_parts_side_by_side(keys: list[str]) -> None:
         "joints": vectors(2, 2),
     }
     space = spaces.Dict({key: everything[key] for key in keys})
-    encoder = MultiInputEncoder(space, cnn_output_dim=5, mlp_output_dim=4)
+    encoder = MultiInputEncoder(space, cnn_output_dim=5, mlp_output_dim=4, vector_encoder=name).eval()
     randomize(encoder)
     batch = {key: th.as_tensor(np.stack([part.sample() for _ in range(3)])) for key, part in space.spaces.items()}
     observations = preprocess_obs(batch, space)
@@ -184,7 +187,7 @@ def test_multi_input_encoder_is_its_parts_side_by_side(keys: list[str]) -> None:
     inputs = [observations[key] for key in space.spaces if key in ("camera", "wrist")]
     flat = [observations[key].reshape(3, -1) for key in space.spaces if key not in ("camera", "wrist")]
     inputs += [th.cat(flat, dim=1)] if flat else []
-    kinds = [PixelEncoder if x.ndim == 4 else DenseMLP for x in inputs]
+    kinds = [PixelEncoder if x.ndim == 4 else vector_encoder for x in inputs]
     assert [type(part) for part in encoder.encoders] == kinds
     expected = [part(x) for part, x in zip(encoder.encoders, inputs, strict=True)]
     assert [latent.shape[1] for latent in expected] == [5 if kind is PixelEncoder else 4 for kind in kinds]
