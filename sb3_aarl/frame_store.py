@@ -150,7 +150,7 @@ class FrameStore:
         self, indices: np.ndarray, newest: np.ndarray, age: np.ndarray, final: np.ndarray, crop_size: int | None = None
     ) -> th.Tensor:
         """
-        Stacked observations; all arrays broadcast to the shape (...) of ``newest``.
+        Stacked observations; ``age`` and ``final`` have the shape (...) of ``newest``, ``indices`` broadcasts to it.
 
         :param indices: Flat indices of their transitions in (buffer_size, n_envs)
         :param newest: Number of the transition whose row holds the newest frame
@@ -160,26 +160,28 @@ class FrameStore:
             its own; the frames of a stack stay together. None for no crop
         :return: (..., *shape), height and width those of the crop, on ``device``
         """
-        indices, age, final = (np.broadcast_to(array, newest.shape) for array in (indices, age, final))
         back = np.arange(self.stack)[::-1]
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
-        numbers = th.from_numpy(rows * self.n_envs + indices[..., None] % self.n_envs)
+        numbers = th.from_numpy(rows * self.n_envs + (indices % self.n_envs)[..., None])
         if crop_size is None:
             frames = self.frames.flatten(0, 1).index_select(0, numbers.flatten().to(self.device))
         else:
             top, left = (th.randint(length - crop_size + 1, newest.shape) for length in self.frame_shape[1:])
             frames = self._crops(numbers, top, left, crop_size)
         stacked = frames.view(*numbers.shape, *frames.shape[1:])
+        indices = np.broadcast_to(indices, newest.shape)
         # Few are at an episode's end or start.
         for index in map(tuple, np.argwhere(final).tolist()):
             frame = self.final_frames[int(indices[index])]
             if crop_size is not None:
                 frame = frame[:, top[index] : top[index] + crop_size, left[index] : left[index] + crop_size]
             stacked[(*index, -1)] = frame
+        if self.stack == 1:
+            return stacked.squeeze(newest.ndim)
         padded = (back > age[..., None]) & self.zero_padded.take(indices)[..., None]
         for index in map(tuple, np.argwhere(padded).tolist()):
             stacked[index] = 0
-        return stacked.flatten(newest.ndim, newest.ndim + 1) if self.stack > 1 else stacked.squeeze(newest.ndim)
+        return stacked.flatten(newest.ndim, newest.ndim + 1)
 
     def _crops(self, numbers: th.Tensor, top: th.Tensor, left: th.Tensor, size: int) -> th.Tensor:
         """

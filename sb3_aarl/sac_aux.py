@@ -5,7 +5,8 @@ import logging
 import math
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
 from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
@@ -25,7 +26,7 @@ from sb3_aarl.aux_head import AuxHead
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
 from sb3_aarl.health import NonFiniteError, QValueCheck, check_finite
-from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy
+from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy, Trunk
 
 logger = logging.getLogger(__name__)
 
@@ -334,86 +335,105 @@ class SACAux(SAC):
         self._update_learning_rates()
         # Networks compute in bfloat16 if asked to; their outputs, and all that is computed from them, are float32.
         autocast = th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bf16")
-        logs: dict[str, dict[int, th.Tensor]] = defaultdict(dict)  # by name and number of the gradient step
+        with self._logged() as log:
+            for _ in range(gradient_steps):
+                self._n_updates += 1
+                update_actor = self._n_updates % self.policy_delay == 0
+                batch, windows = self._sample(batch_size)
+                log("largest_reward", batch.rewards.abs().max())
+                # n-step returns discount by gamma ** n_steps, by less where an episode ended.
+                discounts = self.gamma if batch.discounts is None else batch.discounts
+                if self.use_sde:
+                    self.actor.reset_noise()
 
-        def log(name: str, value: th.Tensor) -> None:
-            logs[name][self._n_updates] = value.detach()
-            if value.device.type == "cpu":  # a GPU would wait for it in every step: its values are checked at the end
-                self._check_loss(name, value.item(), self._n_updates)
-
-        for _ in range(gradient_steps):
-            self._n_updates += 1
-            update_actor = self._n_updates % self.policy_delay == 0
-            batch, windows = self._sample(batch_size)
-            log("largest_reward", batch.rewards.abs().max())
-            # n-step returns discount by gamma ** n_steps, by less where an episode ended.
-            discounts = self.gamma if batch.discounts is None else batch.discounts
-            if self.use_sde:
-                self.actor.reset_noise()
-
-            # Actor and critic both read the trunk of the encoder: computed once.
-            with autocast:
-                trunk = self.critic.trunk(batch.observations)
-                if update_actor:
-                    share = self.actor.share_features_extractor
-                    actions_pi, log_prob = self.actor.action_log_prob(trunk if share else batch.observations)
-                    log_prob = log_prob.reshape(-1, 1)
-
-            # Entropy coefficient: before the critic as in SB3, and the whole step uses its value from before the update.
-            if self.ent_coef_optimizer is None:
-                ent_coef = self.ent_coef_tensor
-            else:
-                assert self.log_ent_coef is not None and isinstance(self.target_entropy, float)
-                ent_coef = self.log_ent_coef.detach().exp()
-                if update_actor:
-                    ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
-                    log("ent_coef_loss", ent_coef_loss)
-                    self.ent_coef_optimizer.zero_grad()
-                    ent_coef_loss.backward()
-                    self.ent_coef_optimizer.step()
-            log("ent_coef", ent_coef)
-
-            # Critic and, through it, the encoder.
-            with th.no_grad(), autocast:
-                next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
-                next_latent = self.critic_target.encode(batch.next_observations)
-                next_q, _ = th.cat(self.critic_target.q_values(next_latent, next_actions), dim=1).min(dim=1, keepdim=True)
-                next_q = next_q - ent_coef * next_log_prob.reshape(-1, 1)
-                target_q = batch.rewards + (1 - batch.dones) * discounts * next_q
-            with autocast:
-                q_values = self.critic.q_values(self.critic.encode(trunk), batch.actions)
-            critic_loss = 0.5 * sum(F.mse_loss(q, target_q) for q in q_values)
-            assert isinstance(critic_loss, th.Tensor)
-            log("critic_loss", critic_loss)
-            self.critic.optimizer.zero_grad()
-            if self.joint_optimizer:
-                self._backward_aux_loss(windows, autocast, log)
-            critic_loss.backward()  # with a joint optimizer it adds to the encoder's gradient
-            self.critic.optimizer.step()
-            if not self.joint_optimizer:
-                self._backward_aux_loss(windows, autocast, log)
-            if self.aux_optimizer is not None and (self.joint_optimizer or windows is not None):
-                self.aux_optimizer.step()
-
-            # Actor: neither the encoder nor the critic gets a gradient from it.
-            if update_actor:
+                # Actor and critic both read the trunk of the encoder: computed once.
                 with autocast:
-                    with th.no_grad():
-                        latent = self.critic.encode(batch.observations)
-                    min_q, _ = th.cat(self.critic.q_values(latent, actions_pi), dim=1).min(dim=1, keepdim=True)
-                actor_loss = (ent_coef * log_prob - min_q).mean()
-                log("actor_loss", actor_loss)
-                trained = [parameter for parameter in self.actor.own_parameters() if parameter.requires_grad]
-                if trained:
-                    self.actor.optimizer.zero_grad()
-                    actor_loss.backward(inputs=trained)
-                    self.actor.optimizer.step()
+                    trunk = self.critic.trunk(batch.observations)
+                    if update_actor:
+                        share = self.actor.share_features_extractor
+                        actions_pi, log_prob = self._act(trunk if share else batch.observations)
 
-            if self._n_updates % self.target_update_interval == 0:
-                self._update_target()
-            # Running statistics of the encoder are copied, see SB3's issue 996.
-            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-        self._record(logs)
+                # Entropy coefficient: before the critic as in SB3, and the whole step uses its value from before the update.
+                if self.ent_coef_optimizer is None:
+                    ent_coef = self.ent_coef_tensor
+                else:
+                    assert self.log_ent_coef is not None and isinstance(self.target_entropy, float)
+                    ent_coef = self.log_ent_coef.detach().exp()
+                    if update_actor:
+                        ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                        log("ent_coef_loss", ent_coef_loss)
+                        self.ent_coef_optimizer.zero_grad()
+                        ent_coef_loss.backward()
+                        self.ent_coef_optimizer.step()
+                log("ent_coef", ent_coef)
+
+                # Critic and, through it, the encoder.
+                with autocast:
+                    target_q = self._target_q(batch.next_observations, batch.rewards, batch.dones, discounts, ent_coef)
+                    critic_loss = self._critic_loss(trunk, batch.actions, target_q)
+                log("critic_loss", critic_loss)
+                self.critic.optimizer.zero_grad()
+                if self.joint_optimizer:
+                    self._backward_aux_loss(windows, autocast, log)
+                critic_loss.backward()  # with a joint optimizer it adds to the encoder's gradient
+                self.critic.optimizer.step()
+                if not self.joint_optimizer:
+                    self._backward_aux_loss(windows, autocast, log)
+                if self.aux_optimizer is not None and (self.joint_optimizer or windows is not None):
+                    self.aux_optimizer.step()
+
+                # Actor: neither the encoder nor the critic gets a gradient from it.
+                if update_actor:
+                    frozen = [parameter for parameter in self.critic.q_parameters() if parameter.requires_grad]
+                    for parameter in frozen:
+                        parameter.requires_grad_(False)
+                    with autocast:
+                        actor_loss = self._actor_loss(batch.observations, actions_pi, log_prob, ent_coef)
+                    log("actor_loss", actor_loss)
+                    if actor_loss.requires_grad:
+                        self.actor.optimizer.zero_grad()
+                        actor_loss.backward()
+                        self.actor.optimizer.step()
+                    for parameter in frozen:
+                        parameter.requires_grad_(True)
+
+                if self._n_updates % self.target_update_interval == 0:
+                    self._update_target()
+                # Running statistics of the encoder are copied, see SB3's issue 996.
+                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+    def _act(self, observations: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
+        """Actions of the actor and their log probabilities, (batch, action_dim) and (batch, 1)."""
+        actions, log_prob = self.actor.action_log_prob(observations)
+        return actions, log_prob.reshape(-1, 1)
+
+    @th.no_grad()
+    def _target_q(
+        self,
+        next_observations: PyTorchObs,
+        rewards: th.Tensor,
+        dones: th.Tensor,
+        discounts: th.Tensor | float,
+        ent_coef: th.Tensor,
+    ) -> th.Tensor:
+        next_actions, next_log_prob = self._act(next_observations)
+        next_latent = self.critic_target.encode(next_observations)
+        next_q, _ = th.cat(self.critic_target.q_values(next_latent, next_actions), dim=1).min(dim=1, keepdim=True)
+        return rewards + (1 - dones) * discounts * (next_q - ent_coef * next_log_prob)
+
+    def _critic_loss(self, trunk: Trunk, actions: th.Tensor, target_q: th.Tensor) -> th.Tensor:
+        q_values = self.critic.q_values(self.critic.encode(trunk), actions)
+        return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
+
+    def _actor_loss(self, observations: PyTorchObs, actions: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
+        with th.no_grad():
+            latent = self.critic.encode(observations)
+        min_q, _ = th.cat(self.critic.q_values(latent, actions), dim=1).min(dim=1, keepdim=True)
+        return (ent_coef * log_prob - min_q).mean()
+
+    def _aux_loss(self, windows: WindowSamples) -> th.Tensor:
+        assert self.aux_head is not None
+        return self.aux_head(windows, self.critic.encode, self.critic_target.encode)
 
     def _sample(self, batch_size: int) -> tuple[ReplayBufferSamples, WindowSamples | None]:
         """
@@ -451,11 +471,9 @@ class SACAux(SAC):
         if windows is None:
             return
         with autocast:
-            aux_loss = self.aux_head(windows, self.critic.encode, self.critic_target.encode)
+            aux_loss = self._aux_loss(windows)
         log("aux_loss", aux_loss)
         (self.aux_coef * aux_loss).backward()
-        trained = self.aux_optimizer.param_groups[0]["params"]
-        log("aux_grad_norm", th.nn.utils.get_total_norm([p.grad for p in trained if p.grad is not None]))
 
     def _update_target(self) -> None:
         # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.
@@ -464,23 +482,31 @@ class SACAux(SAC):
             encoder, momentum_encoder = self.critic.features_extractor, self.critic_target.features_extractor
             polyak_update(encoder.parameters(), momentum_encoder.parameters(), self.encoder_tau)
 
-    def _record(self, logs: Mapping[str, Mapping[int, th.Tensor]]) -> None:
-        """Log the means over gradient steps, and stop a run that has diverged."""
+    @contextmanager
+    def _logged(self) -> Iterator[Callable[[str, th.Tensor], None]]:
+        """Yields ``log(name, value)``; then logs the means over gradient steps, and stops a run that has diverged."""
+        names: list[tuple[str, int]] = []
+        tensors: list[th.Tensor] = []
+
+        def log(name: str, value: th.Tensor) -> None:
+            names.append((name, self._n_updates))
+            tensors.append(value.detach().reshape(()))
+
+        try:
+            yield log
+        finally:  # the first loss that is not finite says more than an error that comes of it
+            losses: dict[str, dict[int, float]] = defaultdict(dict)
+            for (name, step), value in zip(names, th.stack(tensors).tolist() if tensors else [], strict=True):
+                if not math.isfinite(value):
+                    raise NonFiniteError(f"{name} is {value} at {self._describe(step)}")
+                losses[name][step] = value
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/aux_skipped", self._n_aux_skipped)
-        losses: dict[str, dict[int, float]] = {}
-        for name, values in logs.items():
-            losses[name] = dict(zip(values, th.stack([value.reshape(()) for value in values.values()]).tolist(), strict=True))
-            for step, loss in losses[name].items():
-                self._check_loss(name, loss, step)
+        for name, values in losses.items():
             if name != "largest_reward":
-                self.logger.record(f"train/{name}", np.mean(list(losses[name].values())))
+                self.logger.record(f"train/{name}", sum(values.values()) / len(values))
         if losses:
             self._q_value_check(losses, self.gamma, self._action_dim, self._describe)
-
-    def _check_loss(self, name: str, value: float, gradient_step: int) -> None:
-        if not math.isfinite(value):
-            raise NonFiniteError(f"{name} is {value} at {self._describe(gradient_step)}")
 
     def _describe(self, gradient_step: int) -> str:
         return f"gradient step {gradient_step}, agent step {self.num_timesteps}; auxiliary loss: {self.aux_loss}"
