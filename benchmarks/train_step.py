@@ -3,6 +3,7 @@ What one gradient step costs: SACAux beside SB3's SAC with networks of the same 
 
 All run in one process and take turns, so that what disturbs the machine disturbs all; ratios are medians of the ratios
 within each round. ``state``: observations and actions of Cheetah-Run, batch 512, two hidden layers of 1024, AARL-State.
+``small``: the same with SB3's sizes, batch 256 and two hidden layers of 256, on one thread; ``simba`` with that encoder.
 ``pixels``: three stacked frames of 100 x 100 x 3 cropped to 84 x 84, batch 128, AARL-Pixel. SB3's SAC reads pixels of
 84 x 84 through the same encoder class, so that both do the same convolutions. The replay buffers hold random numbers:
 a gradient step costs the same whatever they mean.
@@ -38,9 +39,12 @@ from search.training.provenance import save_result
 ACTION_DIM = 6
 STATE_DIM = 17
 EPISODE = 250
-BATCH = {"state": 512, "pixels": 128}
+BATCH = {"state": 512, "small": 256, "pixels": 128}
+WIDTH = {"state": 1024, "small": 256, "pixels": 1024}
+STEPS = {"state": 6, "small": 40, "pixels": 2}
 REFERENCE_MS, REFERENCE_GFLOPS = {"state": 107, "pixels": 1139}, 220
-TRANSITIONS = {"state": 20_000, "pixels": 2000}
+TRANSITIONS = {"state": 20_000, "small": 20_000, "pixels": 2000}
+SIMBA = {"policy_kwargs": {"features_extractor_class": "simba"}}
 PARTS = ("sampling", "critic", "actor", "auxiliary", "targets")
 
 
@@ -49,7 +53,7 @@ class RandomEnv(gym.Env):
 
     def __init__(self, setting: str, size: int):
         self.action_space = spaces.Box(-1, 1, (ACTION_DIM,), np.float32)
-        if setting == "state":
+        if setting != "pixels":
             self.observation_space = spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)
         else:
             self.observation_space = spaces.Box(0, 255, (9, size, size), np.uint8)
@@ -83,11 +87,11 @@ def fill(model: SAC, transitions: int) -> None:
 
 
 def sb3(setting: str, device: str) -> SAC:
-    kwargs: dict[str, Any] = {"net_arch": [1024, 1024]}
+    kwargs: dict[str, Any] = {"net_arch": [WIDTH[setting]] * 2}
     if setting == "pixels":
         # SB3's own way: one encoder for actor and one for critic, no augmentation, images of the size that convolutions see.
         kwargs["features_extractor_class"] = PixelEncoder
-    policy = "MlpPolicy" if setting == "state" else "CnnPolicy"
+    policy = "CnnPolicy" if setting == "pixels" else "MlpPolicy"
     return SAC(
         policy,
         RandomEnv(setting, 84),
@@ -99,17 +103,21 @@ def sb3(setting: str, device: str) -> SAC:
 
 
 def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
-    policy = "MlpPolicy" if setting == "state" else "CnnPolicy"
+    policy = "CnnPolicy" if setting == "pixels" else "MlpPolicy"
     if setting == "pixels":
         kwargs["replay_buffer_kwargs"] = {"frame_stack": 3, **kwargs.get("replay_buffer_kwargs", {})}
+    kwargs["policy_kwargs"] = {"net_arch": [WIDTH[setting]] * 2, **kwargs.get("policy_kwargs", {})}
     return SACAux(
         policy, RandomEnv(setting, 100), batch_size=BATCH[setting], buffer_size=TRANSITIONS[setting], device=device, **kwargs
     )
 
 
-def modes(device: str) -> dict[str, dict[str, Any]]:
+def modes(setting: str, device: str) -> dict[str, dict[str, Any]]:
     """The ways to run a gradient step on this device, by name."""
     ways: dict[str, dict[str, Any]] = {"fp32": {}, "bf16": {"precision": "bf16"}}
+    ways |= {f"{name}, compiled": {**kwargs, "compile": True} for name, kwargs in ways.items()}
+    if setting == "small":
+        ways |= {f"simba, {name}": {**kwargs, **SIMBA} for name, kwargs in ways.items()}
     if device == "cuda":
         on_gpu = {"replay_buffer_kwargs": {"storage_device": "cuda"}}
         ways |= {f"{name}, storage": {**kwargs, **on_gpu} for name, kwargs in ways.items()}
@@ -121,12 +129,12 @@ def synchronize(device: str) -> None:
         th.cuda.synchronize()
 
 
-def peak(device: str, dtype: th.dtype, batch: int) -> float:
+def peak(device: str, dtype: th.dtype, setting: str) -> float:
     """
-    Floating point operations a second of the product that dominates a step: (batch, 1024) x (1024, 1024). On a GPU, where
+    Floating point operations a second of the product that dominates a step: (batch, width) x (width, width). On a GPU, where
     Python would take longer than that, of a large one.
     """
-    batch, width, n = (8192, 8192, 20) if device == "cuda" else (batch, 1024, 5)
+    batch, width, n = (8192, 8192, 20) if device == "cuda" else (BATCH[setting], WIDTH[setting], 5)
     one, other = th.randn(batch, width, device=device).to(dtype), th.randn(width, width, device=device).to(dtype)
     seconds = []
     for _ in range(10):
@@ -197,7 +205,7 @@ def measure(
     for model in models.values():
         model.set_logger(configure(None, []))
         fill(model, TRANSITIONS[setting])
-        model.train(8, model.batch_size)  # allocates, warms up
+        model.train(8, model.batch_size)  # allocates, warms up, compiles
     seconds: dict[str, list[float]] = {name: [] for name in models}
     for _ in range(rounds):
         for name, model in models.items():
@@ -218,14 +226,14 @@ def measure(
             "ratio": statistics.median(own / base for own, base in zip(seconds[name], seconds["SB3 SAC"], strict=True)),
             "rounds_ms": [1e3 * value for value in seconds[name]],
             "gflop": flops(model) / 1e9,
-            "peak_gflops": peak(device, th.bfloat16 if bf16 else th.float32, BATCH[setting]) / 1e9,
+            "peak_gflops": peak(device, th.bfloat16 if bf16 else th.float32, setting) / 1e9,
         }
         row["share_of_peak"] = row["gflop"] / row["peak_gflops"] / (row["ms"] / 1e3)
         if isinstance(model, SACAux):
             row["parts_ms"] = parts(model, device, 2 * steps)
         rows.append(row)
-    float32_peak = max(row["peak_gflops"] for row in rows if row["algorithm"] != "bf16")
-    for row in rows if device == "cpu" else []:
+    float32_peak = max(row["peak_gflops"] for row in rows if "bf16" not in row["algorithm"])
+    for row in rows if device == "cpu" and setting in REFERENCE_MS else []:
         row["ratio_to_reference"] = row["ms"] / (REFERENCE_MS[setting] * REFERENCE_GFLOPS / float32_peak)
     return rows
 
@@ -252,7 +260,7 @@ def show(rows: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--settings", nargs="+", default=["state", "pixels"], choices=["state", "pixels"])
+    parser.add_argument("--settings", nargs="+", default=list(BATCH), choices=list(BATCH))
     parser.add_argument("--device", default="cuda" if th.cuda.is_available() else "cpu", choices=["cpu", "cuda"])
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--steps", type=int, help="gradient steps of each algorithm in a round")
@@ -262,14 +270,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
-    variants: dict[str, dict[str, Any]] = {"no auxiliary loss": {"aux_loss": None}, **modes(args.device)}
-    rows = []
+    rows, threads = [], th.get_num_threads()
     for setting in args.settings:
-        steps = args.steps or (200 if args.device == "cuda" else {"state": 6, "pixels": 2}[setting])
+        th.set_num_threads(1 if setting == "small" else threads)
+        variants: dict[str, dict[str, Any]] = {"no auxiliary loss": {"aux_loss": None}, **modes(setting, args.device)}
+        steps = args.steps or (200 if args.device == "cuda" else STEPS[setting])
         rows += measure(setting, args.device, variants, args.rounds, steps, args.at_once)
         show(rows)
     if args.out:
-        save_result(args.out, threads=th.get_num_threads(), rows=rows)
+        save_result(args.out, threads=threads, rows=rows)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,8 @@ from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAux
 
 logger = logging.getLogger(__name__)
 
+COMPILED = ("_act", "_target_q", "_critic_loss", "_aux_loss")
+
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
 
 
@@ -160,6 +162,7 @@ class SACAux(SAC):
         augmentation: str = "auto",
         crop_size: int | None = None,
         precision: str = "fp32",
+        compile: bool = False,
         _init_setup_model: bool = True,
     ):
         super().__init__(
@@ -206,6 +209,7 @@ class SACAux(SAC):
         self.augmentation = augmentation
         self.crop_size = crop_size
         self.precision = precision
+        self.compile = compile
 
         self._frame_stack: int | dict[str, int] | None = None  # of the env that the buffer was made for
         self.aux_head: AuxHead | None = None
@@ -243,6 +247,8 @@ class SACAux(SAC):
         self._setup_aux_loss()
         if self.precision == "bf16" and not _computes_bf16(self.device):
             logger.warning("precision='bf16': this %s has no instructions for it, fp32 is faster", self.device.type.upper())
+        if self.compile:
+            self._compile_losses()
 
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, SACAuxPolicy):
@@ -309,6 +315,19 @@ class SACAux(SAC):
         self.aux_optimizer = self.policy.make_optimizer([*encoder, *self.aux_head.parameters()], schedule)
         if self.joint_optimizer:
             self.critic.optimizer = self.policy.make_optimizer(self.critic.q_parameters(), self.lr_schedule)
+
+    def _compile_losses(self) -> None:
+        try:
+            th.compile(th.square)(th.ones(1, device=self.device))
+        except RuntimeError as error:
+            logger.warning(
+                "compile=True: torch.compile does not work here, nothing is compiled: %s", str(error).partition("\n")[0]
+            )
+            return
+        # The actor loss stays as it is: compiled, its backward pass computes gradients of the critics too.
+        for name in COMPILED:
+            # The random numbers are PyTorch's own.
+            setattr(self, name, th.compile(getattr(self, name), options={"fallback_random": True}))
 
     @property
     def _action_dim(self) -> int:
@@ -578,6 +597,9 @@ class SACAux(SAC):
         for name, value in state["counters"].items():
             setattr(self, name, value)
         self._q_value_check = QValueCheck(**state["q_value_check"])
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *COMPILED]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

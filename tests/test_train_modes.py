@@ -1,5 +1,8 @@
 """The gradient step in bfloat16, and with fused optimizers: still the same step."""
 
+import os
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -91,6 +94,31 @@ def test_bfloat16_predicts_and_is_saved_in_float32(tmp_path: Any) -> None:
     assert exact.precision == "fp32"
     observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     assert_same(model.predict(observations, deterministic=True)[0], exact.predict(observations, deterministic=True)[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-4), ("bf16", 0.05)])
+def test_compiled_losses_have_the_same_gradients(precision: str, tolerance: float, tmp_path: Any) -> None:
+    gradients = []
+    for compiled in (False, True):
+        model = filled_model(precision=precision, compile=compiled, policy_delay=1)
+        np.random.seed(1)
+        th.manual_seed(1)
+        model.train(1, batch_size=64)
+        trained = [*model.critic.parameters(), *model.actor.own_parameters(), *model.aux_head.parameters()]
+        gradients.append(th.cat([parameter.grad.flatten() for parameter in trained]))
+    assert (gradients[0] - gradients[1]).norm() < tolerance * gradients[0].norm()
+    model.save(tmp_path / "model")
+    assert type(model).load(tmp_path / "model").compile
+
+
+@pytest.mark.slow
+def test_without_a_compiler_nothing_is_compiled(tmp_path: Any) -> None:
+    program = "from sb3_aarl import SACAux; SACAux('MlpPolicy', 'Pendulum-v1', learning_starts=9, compile=True).learn(12)"
+    env = {**os.environ, "CXX": "/no/compiler", "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True, check=True)
+    assert done.stderr.count("torch.compile does not work here, nothing is compiled: ") == 1
+    assert "/no/compiler" in done.stderr
 
 
 @pytest.mark.parametrize("given", [{}, {"foreach": True}, {"fused": False}, {"eps": 1e-3}], ids=str)
