@@ -2,6 +2,7 @@
 # make test    all tests, what they need included
 # make check   lint, types, and the tests that are not slow
 # make lint    ruff and mypy
+# make docs    the documentation, docs/_build/html/index.html
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -11,7 +12,7 @@ RENDERING := libegl1 libosmesa6 libgl1-mesa-dri
 BROWSER := chromium chromium-driver
 DATABASE := postgresql
 
-.PHONY: demo test check lint system clean
+.PHONY: demo test check lint docs system clean
 
 demo: $(VENV)/.installed
 	$(BIN)/aarl search zoo_configs/search/demo.yml --workers 2
@@ -30,6 +31,9 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -q -W -b html docs docs/_build/html
+
 # labmaze, which dm-control asks for, has no wheel for Python 3.13; the suite does not need it.
 define install
 	$(PYTHON) -m venv $(VENV)
@@ -43,6 +47,9 @@ endef
 
 $(VENV)/.installed: setup.cfg constraints.txt
 	$(call install,search)
+
+$(VENV)/.installed-docs: setup.cfg constraints.txt
+	$(call install,docs)
 
 $(VENV)/.installed-dev: setup.cfg constraints.txt
 	$(call install,dev)
