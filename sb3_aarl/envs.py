@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import difflib
+import functools
 import logging
 import os
 import sys
@@ -40,15 +41,11 @@ _choose_renderer()
 # software, the two copies of LLVM crash the process; in this order they do not.
 with contextlib.suppress(ImportError):
     import triton  # type: ignore[import-not-found]  # noqa: F401
-# Locomotion tasks need labmaze, which has no wheel for Python 3.13: shimmy prints a warning at every import.
-with contextlib.redirect_stdout(None):
-    import shimmy  # noqa: F401  (registers dm_control/...)
-from dm_control import suite  # noqa: E402
-
-# dm_control's models use what MuJoCo has deprecated: a warning for each environment.
-logging.getLogger("absl").addFilter(lambda record: "settotalmass" not in record.getMessage())
 
 PREFIX = "dm_control/"
+NEEDS_DMC = (
+    'DeepMind Control\'s tasks need: pip install "sb3-aarl[dmc]" (on Python 3.13 also: pip install --no-deps dm-control)'
+)
 # Environment steps of an episode; only LQR has no time limit of its own.
 EPISODE_LENGTH = 1000
 # The camera that papers render a domain with, where it is not the first one (CURL, DrQ-v2: behind the quadruped).
@@ -77,8 +74,21 @@ class RepeatAction(gym.Wrapper):
         return observation, total, terminated, truncated, info
 
 
+@functools.cache
 def env_ids() -> list[str]:
-    """The ids of all tasks of the DeepMind Control Suite, such as ``dm_control/cheetah-run-v0``."""
+    """
+    The ids of all tasks of the DeepMind Control Suite, such as ``dm_control/cheetah-run-v0``, and Gymnasium knows them from
+    then on. None where the extra ``dmc`` is not installed.
+    """
+    try:
+        # Locomotion tasks need labmaze, which has no wheel for Python 3.13: shimmy prints a warning at its import.
+        with contextlib.redirect_stdout(None):
+            import shimmy  # noqa: F401  (registers them)
+        from dm_control import suite
+    except ModuleNotFoundError:
+        return []
+    # dm_control's models use what MuJoCo has deprecated: a warning for each environment.
+    logging.getLogger("absl").addFilter(lambda record: "settotalmass" not in record.getMessage())
     return sorted(f"{PREFIX}{domain}-{task}-v0" for domain, task in suite.ALL_TASKS)
 
 
@@ -110,8 +120,11 @@ def make_dmc_env(
         but other pictures than the suite's own
     :param seed: Seed of the initial states from the first ``reset()`` on, and of ``action_space``; None for a random one
     :raises ValueError: for an unknown task, with the nearest ones
+    :raises ImportError: without the extra ``dmc``
     """
     known = env_ids()
+    if not known:
+        raise ImportError(NEEDS_DMC)
     if env_id not in known:
         full = f"{PREFIX}{env_id.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
         if full not in known:

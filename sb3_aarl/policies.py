@@ -242,7 +242,7 @@ class SACAuxPolicy(SACPolicy):
     :param observation_space: Observation space
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule
-    :param net_arch: Hidden layers of actor and critic, two of 1024 by default (paper, tables 7 and 8)
+    :param net_arch: Hidden layers of actor and critic, as in SB3 (two of 256; the paper has two of 1024, tables 7 and 8)
     :param features_extractor_class: The encoder: a name of ``encoders.ENCODERS`` or a class
     :param features_extractor_kwargs: Its keyword arguments; of a network among them each encoder gets a copy
     :param share_features_extractor: True (default, CURL's pixel agent): the actor reads the critic's encoder
@@ -304,7 +304,7 @@ class SACAuxPolicy(SACPolicy):
             observation_space,
             action_space,
             lr_schedule,
-            net_arch=[1024, 1024] if net_arch is None else net_arch,
+            net_arch=net_arch,
             features_extractor_class=encoder,
             features_extractor_kwargs=features_extractor_kwargs,
             share_features_extractor=share_features_extractor,

@@ -47,15 +47,16 @@ class SACAux(SAC):
     Soft Actor-Critic with an auxiliary loss on its encoder (AARL), around SB3's SAC.
 
     The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The
-    encoder of the target critic is the momentum encoder of the auxiliary loss. Defaults are the paper's tables 7 and 8
-    unless another source is named; what differs there between tasks has the value of most tasks.
+    encoder of the target critic is the momentum encoder of the auxiliary loss. Arguments of SB3's SAC have its defaults,
+    those of SACAux alone the paper's (tables 7 and 8) unless another source is named. ``zoo_configs/`` has all of the
+    paper's values.
 
     :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
-    :param learning_rate: Of actor and critic, may be a schedule (1e-3; 2e-4 for Cheetah-Run)
+    :param learning_rate: Of actor and critic, may be a schedule
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts
-    :param batch_size: Transitions for each critic and actor update (512; 128 during the evolution from pixels)
+    :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 0 freezes the whole target critic, as in SB3
     :param gamma: Discount factor
     :param train_freq: As in SB3
@@ -66,7 +67,7 @@ class SACAux(SAC):
         must be given for a class of your own
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns, not for Dict observations (as in SB3)
-    :param ent_coef: Entropy coefficient; ``"auto_0.1"`` learns it from 0.1 on
+    :param ent_coef: As in SB3 (``"auto_0.1"``)
     :param target_update_interval: Gradient steps between updates of the target critic
     :param target_entropy: As in SB3
     :param use_sde: Whether to use gSDE, as in SB3
@@ -94,8 +95,9 @@ class SACAux(SAC):
     :param predictor_width: Hidden units of the predictor (256), None for twice its input (the reference)
     :param predictor_batch_norm: Whether the predictor has batch norm (the paper names none, the reference has it)
     :param policy_delay: Gradient steps between updates of actor and entropy coefficient (2: CURL, the reference)
-    :param ent_coef_learning_rate: Of the entropy coefficient, may be a schedule; None for ``learning_rate`` (SB3)
-    :param ent_coef_betas: Adam's betas for the entropy coefficient (SB3: (0.9, 0.999))
+    :param ent_coef_learning_rate: Of the entropy coefficient, may be a schedule; None (SB3) for ``learning_rate``. The
+        paper's 1e-4 is for ``ent_coef="auto_0.1"``: from 1 on, where ``"auto"`` begins, it takes too long
+    :param ent_coef_betas: Adam's betas for the entropy coefficient, SB3's (the paper has (0.5, 0.999))
     :param augmentation: ``"random_crop"`` to ``crop_size`` in training with a centre crop elsewhere,
         ``"random_shift"`` by up to 4 pixels, ``"none"``; ``"auto"`` crops if all images are larger than ``crop_size``
         and shifts if not. Vectors are never augmented
@@ -123,11 +125,11 @@ class SACAux(SAC):
         self,
         policy: str | type[SACAuxPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        buffer_size: int = 100_000,
-        learning_starts: int = 1000,
-        batch_size: int = 512,
-        tau: float = 0.01,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
         gamma: float = 0.99,
         train_freq: int | tuple[int, str] = 1,
         gradient_steps: int = 1,
@@ -136,8 +138,8 @@ class SACAux(SAC):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        ent_coef: str | float = "auto_0.1",
-        target_update_interval: int = 2,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
         target_entropy: str | float = "auto",
         use_sde: bool = False,
         sde_sample_freq: int = -1,
@@ -157,8 +159,8 @@ class SACAux(SAC):
         predictor_width: int | None = 256,
         predictor_batch_norm: bool = False,
         policy_delay: int = 2,
-        ent_coef_learning_rate: float | Schedule | None = 1e-4,
-        ent_coef_betas: tuple[float, float] = (0.5, 0.999),
+        ent_coef_learning_rate: float | Schedule | None = None,
+        ent_coef_betas: tuple[float, float] = (0.9, 0.999),
         augmentation: str = "auto",
         crop_size: int | None = None,
         precision: str = "fp32",
@@ -553,7 +555,7 @@ class SACAux(SAC):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
-        tb_log_name: str = "SACAux",
+        tb_log_name: str = "SAC",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfSACAux:
@@ -566,12 +568,17 @@ class SACAux(SAC):
                 logger.warning("the replay buffer lacks frames of the running episodes: the environments are reset")
                 self._last_obs = None
         try:
-            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         except ValueError as error:
             # PyTorch's distributions refuse NaN before any loss is computed, and know neither the step nor the cause.
             if "to satisfy the constraint" not in str(error):
                 raise
             raise NonFiniteError(f"an output of the actor is not finite at {self._describe(self._n_updates)}") from error
+        if not self._n_updates:
+            logger.warning("nothing was learnt: learning starts after %d agent steps", self.learning_starts)
+        elif self._n_aux_skipped == self._n_updates:
+            logger.warning("the auxiliary loss was never trained: no episode is as long as its horizon (%s)", self.aux_loss)
+        return self
 
     def training_state(self) -> dict[str, Any]:
         """

@@ -133,9 +133,7 @@ def sac_and_ours(policy: str, env: Callable[[], Any], steps: int, ours: dict[str
     both |= {"seed": 5, "device": "cpu", **settings}
     sac = SAC(policy, env(), **both).learn(steps)
     ours = {**both, **ours, "policy_kwargs": {**both["policy_kwargs"], **ours["policy_kwargs"]}}
-    as_in_sb3: dict[str, Any] = {"policy_delay": 1, "target_update_interval": 1, "ent_coef_learning_rate": None}
-    as_in_sb3 |= {"ent_coef_betas": (0.9, 0.999), "ent_coef": "auto", "aux_loss": None}
-    return sac, SACAux(policy, env(), **{**as_in_sb3, **ours}).learn(steps)
+    return sac, SACAux(policy, env(), **{"policy_delay": 1, "aux_loss": None, **ours}).learn(steps)
 
 
 @pytest.mark.parametrize(
@@ -370,6 +368,7 @@ def test_train_agrees_with_naive_steps(
         aux_batch_size=24,
         gamma=0.9,
         tau=0.1,
+        target_update_interval=2,
         encoder_tau=0.3,
         joint_optimizer=joint,
         predictor_batch_norm=batch_norm,
@@ -508,12 +507,14 @@ def test_logs() -> None:
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_a_horizon_longer_than_any_episode_is_skipped_and_counted(joint: bool) -> None:
+def test_a_horizon_longer_than_any_episode_is_skipped_and_counted(joint: bool, caplog: pytest.LogCaptureFixture) -> None:
     model = make_model(env=make_env("state", length=4), aux_loss="{s_t} -> {s_t+5}", joint_optimizer=joint)
     before = copy.deepcopy(model.aux_head.state_dict())
     encoder = copy.deepcopy(model.critic.features_extractor.state_dict())
     model.learn(50, log_interval=1000)
     assert model.logger.name_to_value["train/aux_skipped"] == model._n_updates == 30
+    messages = [record.getMessage() for record in caplog.records]
+    assert messages == ["the auxiliary loss was never trained: no episode is as long as its horizon ({s_t} -> {s_t+5})"]
     assert "train/aux_loss" not in model.logger.name_to_value
     assert_same(dict(model.aux_head.state_dict()), before)
     assert all(not th.equal(value, encoder[name]) for name, value in model.critic.features_extractor.state_dict().items())
@@ -524,6 +525,11 @@ def test_a_horizon_longer_than_any_episode_is_skipped_and_counted(joint: bool) -
     assert 30 < model.logger.name_to_value["train/aux_skipped"] < 60
     assert math.isfinite(model.logger.name_to_value["train/aux_loss"])
     assert not th.equal(model.aux_head.state_dict()["predictor.0.weight"], before["predictor.0.weight"])
+
+
+def test_a_run_that_learns_nothing_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    make_model(learning_starts=50).learn(50)
+    assert [record.getMessage() for record in caplog.records] == ["nothing was learnt: learning starts after 50 agent steps"]
 
 
 # --- Save and load -----------------------------------------------------------------------------------------------------
@@ -633,7 +639,7 @@ def test_loading_with_other_n_step_returns(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(("n_envs", "normalized"), [(1, False), (2, True)])
 def test_a_buffer_that_was_emptied_inside_an_episode(n_envs: int, normalized: bool, caplog: pytest.LogCaptureFixture) -> None:
     env: Any = VecFrameStack(make_env("pixels", n_envs, length=50), 3, channels_order="first")
-    model = make_model("pixels", VecNormalize(env, norm_obs=False) if normalized else env)
+    model = make_model("pixels", VecNormalize(env, norm_obs=False) if normalized else env, learning_starts=10)
     model.learn(20)
     model.learn(4, reset_num_timesteps=False)
     assert not caplog.records  # it continues inside the episode

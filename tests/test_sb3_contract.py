@@ -1,5 +1,6 @@
 """What SB3 promises for SAC holds for SACAux: spaces, images, vectorized environments, wrappers, callbacks, options."""
 
+import inspect
 import warnings
 from copy import deepcopy
 from pathlib import Path
@@ -122,6 +123,12 @@ def assert_predicts(model: SACAux, observations: list[Any]) -> np.ndarray:
 def assert_equal_parameters(first: SACAux, second: SACAux) -> None:
     for (name, one), other in zip(first.policy.state_dict().items(), second.policy.state_dict().values(), strict=True):
         assert th.equal(one, other), name
+
+
+@pytest.mark.parametrize("method", ["__init__", "learn"])
+def test_defaults_are_those_of_sac(method: str) -> None:
+    ours, sacs = (inspect.signature(getattr(cls, method)).parameters for cls in (SACAux, SAC))
+    assert {name: ours[name].default for name in sacs} == {name: parameter.default for name, parameter in sacs.items()}
 
 
 @pytest.mark.parametrize(
