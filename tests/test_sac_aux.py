@@ -369,6 +369,7 @@ def test_train_agrees_with_naive_steps(
         gamma=0.9,
         tau=0.1,
         target_update_interval=2,
+        ent_coef_betas=(0.5, 0.999),
         encoder_tau=0.3,
         joint_optimizer=joint,
         predictor_batch_norm=batch_norm,
