@@ -2,6 +2,7 @@
 # make test    all tests, what they need included
 # make check   lint, types, and the tests that are not slow
 # make lint    ruff and mypy
+# make wheel   builds the wheel, installs it without extras and trains with it
 # make docs    the documentation, docs/_build/html/index.html
 
 PYTHON ?= python3
@@ -11,8 +12,9 @@ BIN := $(VENV)/bin
 RENDERING := libegl1 libosmesa6 libgl1-mesa-dri
 BROWSER := chromium chromium-driver
 DATABASE := postgresql
+DEMO := dmc,search
 
-.PHONY: demo test check lint docs system clean
+.PHONY: demo test check lint docs wheel system clean
 
 demo: $(VENV)/.installed
 	$(BIN)/aarl search zoo_configs/search/demo.yml --workers 2
@@ -46,7 +48,7 @@ define install
 endef
 
 $(VENV)/.installed: setup.cfg constraints.txt
-	$(call install,search)
+	$(call install,$(DEMO))
 
 $(VENV)/.installed-docs: setup.cfg constraints.txt
 	$(call install,docs)
@@ -65,6 +67,19 @@ system:
 		if ! { $$sudo apt-get update -qq && $$sudo apt-get install -y -qq --no-install-recommends $$missing; } >/dev/null 2>&1; \
 		then echo "Some tests need system packages that could not be installed; as root: apt-get install$$missing"; fi; \
 	fi
+
+# As a user has it: the wheel without extras and constraints in an empty environment, README's first examples in an empty
+# folder. Only PyTorch is the version that was tested: that is small where pip finds a build of it for the CPU.
+wheel:
+	set -e; folder=$$(mktemp -d); trap 'rm -rf $$folder' EXIT; \
+	$(PYTHON) -m venv $$folder/venv; \
+	export PATH=$$folder/venv/bin:$$PATH; \
+	pip wheel --quiet --no-deps --wheel-dir $$folder .; \
+	pip install --quiet $$(grep ^torch== constraints.txt) $$folder/*.whl; \
+	cd $$folder; \
+	python -c 'from sb3_aarl import SACAux; SACAux("MlpPolicy", "Pendulum-v1", aux_loss="aarl-state").learn(150)'; \
+	aarl losses; \
+	aarl train Pendulum-v1 --steps 600 --evaluations 2 --episodes 1
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

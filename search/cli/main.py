@@ -12,7 +12,7 @@ from search.cli.console import errors
 
 # Training alone does without these modules; the extra that has them.
 EXTRAS = {"psycopg": "postgres", "ray": "ray"}
-OF_SEARCH = ("filelock", "matplotlib", "optuna", "optuna_dashboard", "pandas", "plotly", "sklearn", "sqlalchemy", "tenacity")
+OF_SEARCH = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "plotly", "scipy", "sklearn", "sqlalchemy", "tenacity")
 
 
 class Program(TyperGroup):

@@ -23,7 +23,7 @@ from sb3_aarl import SACAux, catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import WindowReplayBuffer
 from sb3_aarl.encoders import ENCODERS, encoder_class
-from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env, wrap_env
+from sb3_aarl.envs import NEEDS_DMC, PREFIX, env_ids, make_dmc_env, wrap_env
 from sb3_aarl.policies import SACAuxPolicy
 
 # How several environments run, under the names of RL-Zoo's option --vec-env.
@@ -109,15 +109,16 @@ def resolve_env_id(name: str) -> str:
 
     :raises ConfigError: for an unknown one, with the nearest
     """
-    full = f"{PREFIX}{name.lower()}-v0"
-    if full in env_ids():
-        return full
     # Not gym.spec or gym.make, which import what stands before a colon.
     if name in gym.registry:
         return name
+    full = f"{PREFIX}{name.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
+    if full in env_ids():
+        return full
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
     nearest = difflib.get_close_matches(name, known, cutoff=0.4)
-    raise ConfigError(f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}")
+    hint = "" if env_ids() else f". {NEEDS_DMC}"
+    raise ConfigError(f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}{hint}")
 
 
 def import_modules(names: Sequence[str]) -> Sequence[str]:
