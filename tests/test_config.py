@@ -235,6 +235,9 @@ def test_an_environments_own_entry_is_merged_over_the_default(tmp_path: Path) ->
         ("train_freq: [1, episode]", (1, "episode")),  # SB3 requires a tuple
         ("ent_coef: 0.1", 0.1),
         ("ent_coef: auto_0.1", "auto_0.1"),
+        ("learning_rate: lin_7.3e-4", "lin_7.3e-4"),
+        ("encoder_learning_rate: lin_0.001", "lin_0.001"),
+        ("ent_coef_learning_rate: lin_1", "lin_1"),
         ("encoder_learning_rate: null", None),
         ("ent_coef_betas: [0.5, 0.999]", (0.5, 0.999)),
         ("aux_loss: auto", "auto"),
@@ -242,6 +245,16 @@ def test_an_environments_own_entry_is_merged_over_the_default(tmp_path: Path) ->
         ("aux_loss: '{s_t} -> {r_t}'", "{s_t} -> {r_t}"),
         ("normalize: true", True),
         ("normalize: {norm_reward: false, clip_obs: 5}", {"norm_reward": False, "clip_obs": 5.0}),
+        ("normalize: 'dict(norm_obs=True, norm_reward=False)'", {"norm_obs": True, "norm_reward": False}),
+        ("normalize: \"{'norm_obs': True}\"", {"norm_obs": True}),
+        ("policy_kwargs: 'dict(net_arch=[400, 300], log_std_init=-3)'", {"net_arch": [400, 300], "log_std_init": -3}),
+        ("policy_kwargs: 'dict(net_arch=dict(pi=[8], qf=[4]))'", {"net_arch": {"pi": [8], "qf": [4]}}),
+        ("replay_buffer_kwargs: 'dict(\n    handle_timeout_termination=False)'", {"handle_timeout_termination": False}),
+        ("env_wrapper: ClipAction", "ClipAction"),
+        (
+            "env_wrapper: [rl_zoo3.wrappers.HistoryWrapper: {horizon: 2}]",
+            [{"rl_zoo3.wrappers.HistoryWrapper": {"horizon": 2}}],
+        ),
         ("vec_env: subproc", "subproc"),
         ("policy_kwargs: {net_arch: {pi: [8], qf: [4]}}", {"net_arch": {"pi": [8], "qf": [4]}}),
         ("policy_kwargs: {features_extractor_kwargs: null}", {"features_extractor_kwargs": None}),
@@ -368,7 +381,18 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"overrides": {"normalize": 3}}, "normalize: should be a valid boolean, not 3"),
     ({"overrides": {"policy": "MlpLstmPolicy"}}, "policy: should be 'MlpPolicy'"),
     ({"overrides": {"batch_size": "many"}}, "batch_size: should be a valid integer, not 'many'"),
-    ({"overrides": {"learning_rate": "lin_1e-3"}}, "learning_rate: should be a valid number, not 'lin_1e-3'"),
+    ({"overrides": {"learning_rate": "exp_1e-3"}}, "learning_rate: should be a valid number, not 'exp_1e-3', or .*'lin_3e-4'"),
+    ({"overrides": {"encoder_learning_rate": "lin_nan"}}, "encoder_learning_rate: .*'lin_3e-4', not 'lin_nan'"),
+    ({"overrides": {"env_wrapper": "os.TimeLimit"}}, "env_wrapper: 'os.TimeLimit' is none of .*, TimeLimit"),
+    ({"overrides": {"env_wrapper": [{"TimeLimit": 3}]}}, "env_wrapper: TimeLimit must have a mapping of arguments, not 3"),
+    ({"overrides": {"env_wrapper": ["rl_zoo3.wrappers.FrameSkip"]}}, "env_wrapper: write .*action_repeat: 2"),
+    ({"overrides": {"policy_kwargs": "dict(activation_fn=nn.ReLU)"}}, "policy_kwargs: must be a mapping of plain values, not"),
+    ({"overrides": {"policy_kwargs": "dict([('net_arch', [2])])"}}, "policy_kwargs: must be a mapping of plain values, not"),
+    ({"overrides": {"policy_kwargs": "dict(net_arc=[2])"}}, "policy_kwargs.net_arc: .*'net_arch'"),
+    ({"overrides": {"normalize": "dict(norm_obz=True)"}}, "normalize.norm_obz: .*'norm_obs'"),
+    ({"overrides": {"replay_buffer_class": "HerReplayBuffer"}}, "replay_buffer_class: .*aux_loss=None"),
+    ({"overrides": {"frame_stack": 4}}, "frame_stack: write env_kwargs"),
+    ({"overrides": {"callback": "rl_zoo3.callbacks.ParallelTrainCallback"}}, "callback: .*sb3_aarl.rl_zoo"),
     ({"overrides": {"aux_loss": "no-such-loss"}}, "aux_loss: .*no-such-loss"),
     ({"overrides": {"n_envs": 0}}, "n_envs: should be greater than 0"),
     ({"overrides": {"n_envs": 1.5}}, "n_envs: should be a valid integer"),
@@ -458,12 +482,37 @@ def test_files_that_are_not_plain_are_refused_and_evaluate_nothing(tmp_path: Pat
     assert not marker.exists()
 
 
+def test_texts_of_an_entry_are_merged_over_the_default(tmp_path: Path) -> None:
+    default = {"policy_kwargs": {"net_arch": [7]}, "env_wrapper": "ClipAction"}
+    write(tmp_path, hyper={"default": default, "Pendulum-v1": {"policy_kwargs": "dict(log_std_init=-2)"}})
+    assert load_hyperparameters(tmp_path / "hyper.yml", "Pendulum-v1") == {
+        "policy_kwargs": {"net_arch": [7], "log_std_init": -2},
+        "env_wrapper": "ClipAction",
+    }
+
+
+def test_rl_zoos_own_hyperparameters_of_sac() -> None:
+    """All but what needs another replay buffer, and what wraps environments with a program that RL-Zoo does not have."""
+    rl_zoo3 = pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
+    path = Path(rl_zoo3.__file__).parent / "hyperparams" / "sac.yml"
+    refused = {}
+    for name in (entries := read_yaml(path)):
+        try:
+            load_hyperparameters(path, name)
+        except ConfigError as error:
+            refused[name] = str(error).removeprefix(f"{path}: ").partition(":")[0]
+    assert refused == {"CarRacing-v3": "env_wrapper", "FetchReach-v1": "replay_buffer_class"}
+    assert len(entries) == 26
+
+
 def test_text_is_not_evaluated(tmp_path: Path) -> None:
     """As RL-Zoo does with its files."""
     code = f"__import__('pathlib').Path({str(tmp_path / 'evaluated')!r}).touch()"
-    for key in ("learning_rate", "policy", "policy_kwargs", "env_kwargs", "ent_coef", "tensorboard_log"):
+    texts = ("policy_kwargs", "replay_buffer_kwargs", "normalize")
+    keys = ("learning_rate", "policy", "env_kwargs", "env_wrapper", "ent_coef", "tensorboard_log", *texts)
+    for key, value in [(key, code) for key in keys] + [(key, f"dict(gamma={code})") for key in texts]:
         try:
-            check_hyperparameters({key: code}, "Pendulum-v1", "here")
+            check_hyperparameters({key: value}, "Pendulum-v1", "here")
         except ConfigError:
             assert key not in ("ent_coef", "tensorboard_log")  # which may be text
     assert not (tmp_path / "evaluated").exists()

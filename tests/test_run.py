@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import DENSE
 
 from sb3_aarl import SACAux
@@ -321,6 +322,50 @@ def test_the_replay_buffer_is_no_larger_than_the_run(tmp_path: Path, monkeypatch
         with pytest.raises(ZeroDivisionError):
             train(tmp_path / str(n_envs))
         assert sizes[-1] == size
+
+
+def test_tensorboard_has_every_evaluation_of_a_short_run(tmp_path: Path) -> None:
+    """SB3 alone writes after every fourth episode."""
+    hyperparameters = DENSE | {"tensorboard_log": str(tmp_path / "tensorboard")}
+    prepare_run(tmp_path / "run", make_run(checkpoints=(16, 32, 48), hyperparameters=hyperparameters))
+    curve = train(tmp_path / "run")
+    (folder,) = (tmp_path / "tensorboard").iterdir()
+    events = EventAccumulator(str(folder)).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("eval/mean_reward")] == [
+        (point.environment_steps, pytest.approx(point.mean)) for point in curve
+    ]
+    for name in ("rollout/ep_rew_mean", "rollout/ep_len_mean", "train/critic_loss", "train/aux_loss"):
+        assert events.Scalars(name)[-1].step == 48
+
+
+def test_learning_rates_that_fall(tmp_path: Path) -> None:
+    rates = {"learning_rate": "lin_1e-2", "encoder_learning_rate": "lin_2e-3", "ent_coef_learning_rate": "lin_4e-4"}
+    prepare_run(tmp_path, make_run(hyperparameters=DENSE | rates, keep_model=True))
+    train(tmp_path)
+    model = SACAux.load(tmp_path / "model.zip")
+    assert [model.lr_schedule(share) for share in (1, 0.25)] == pytest.approx([1e-2, 2.5e-3])
+    assert model.aux_optimizer is not None and model.ent_coef_optimizer is not None
+    # At the last step, nothing is left of them.
+    for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer, model.ent_coef_optimizer):
+        assert optimizer.param_groups[0]["lr"] == 0
+
+
+def test_wrappers_are_in_training_and_evaluation(tmp_path: Path) -> None:
+    wrappers = ["ClipAction", {"gymnasium.wrappers.time_limit.TimeLimit": {"max_episode_steps": 8}}]
+    setup = module.Setup(make_run(hyperparameters=DENSE | {"env_wrapper": wrappers}), "here")
+    for env in (setup.training_env(), setup.evaluation_env()):
+        env.reset()
+        assert [bool(env.step(np.array([[0.0]] * env.num_envs))[2][0]) for _ in range(8)] == [False] * 7 + [True]
+        assert env.env_is_wrapped(gym.wrappers.ClipAction)[0]
+
+
+def test_wrappers_of_rl_zoo_can_be_trained_with(tmp_path: Path) -> None:
+    pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
+    wrappers = ["sb3_contrib.common.wrappers.TimeFeatureWrapper", {"rl_zoo3.wrappers.HistoryWrapper": {"horizon": 3}}]
+    prepare_run(tmp_path, make_run(hyperparameters=DENSE | {"env_wrapper": wrappers}, keep_model=True))
+    train(tmp_path)
+    # Two numbers and the time, three times, and three actions.
+    assert SACAux.load(tmp_path / "model.zip").observation_space.shape == (3 * 3 + 3,)
 
 
 @pytest.mark.slow

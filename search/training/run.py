@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import functools
+import importlib
 import json
 import logging
 import math
@@ -18,13 +19,22 @@ import pydantic
 import torch as th
 from filelock import FileLock, Timeout
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, read_curve, replace_text, write_curve
 from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
 from search.training import checkpoint
-from search.training.config import VEC_ENVS, ConfigError, action_repeat, check_hyperparameters, import_modules, validated
+from search.training.config import (
+    VEC_ENVS,
+    ConfigError,
+    action_repeat,
+    check_hyperparameters,
+    env_wrappers,
+    import_modules,
+    validated,
+)
 from search.training.provenance import add_session, read_about, write_about
 
 logger = logging.getLogger(__name__)
@@ -167,9 +177,14 @@ def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int
     return tuple(every * (i + 1) for i in range(n_evaluations))
 
 
-def _make_in_process(imports: Sequence[str], env_id: str, env_kwargs: Mapping[str, Any], steps: Sequence[int]) -> gym.Env:
+def _make_in_process(
+    imports: Sequence[str], env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any, steps: Sequence[int]
+) -> gym.Env:
     import_modules(imports)  # the process may be one of the environment alone
-    return checkpoint.TruncateAt(make_env(env_id, env_kwargs), steps)
+    env = make_env(env_id, env_kwargs)
+    for module, name, arguments in env_wrappers(env_wrapper):
+        env = getattr(importlib.import_module(module), name)(env, **arguments)
+    return checkpoint.TruncateAt(env, steps)
 
 
 class _Setup:
@@ -189,6 +204,7 @@ class _Setup:
             raise ConfigError(f"{source}: train_freq must be 1 episode at most: a rollout has to end at each checkpoint")
         settings.pop("n_timesteps", None)
         self.env_kwargs: dict[str, Any] = settings.pop("env_kwargs", None) or {}
+        self.env_wrapper = settings.pop("env_wrapper", None)
         self.pixels = self.env_kwargs.get("pixels", False)
         self.policy = settings.pop("policy", "CnnPolicy" if self.pixels else "MlpPolicy")
         self.n_envs, self.vec_env = settings.pop("n_envs", 1), VEC_ENVS[settings.pop("vec_env", "dummy")]
@@ -200,6 +216,9 @@ class _Setup:
         if "buffer_size" in settings:
             # The same run with a smaller checkpoint; each environment has an equal share of the buffer.
             settings["buffer_size"] = min(settings["buffer_size"], math.ceil(self.agent_steps / self.n_envs) * self.n_envs)
+        for key, value in settings.items():
+            if key.endswith("learning_rate") and isinstance(value, str):
+                settings[key] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
         self.settings = settings | {"aux_loss": run.aux_loss, "seed": run.seed}
 
         limit = EPISODE_LENGTH if run.environment.startswith(PREFIX) else gym.spec(run.environment).max_episode_steps
@@ -209,7 +228,8 @@ class _Setup:
             logger.warning(message, apart // self.n_envs, limit)
 
     def _make(self, steps: Sequence[int] = ()) -> Callable[[], gym.Env]:
-        return functools.partial(_make_in_process, self.run.imports, self.run.environment, self.env_kwargs, steps)
+        run = self.run
+        return functools.partial(_make_in_process, run.imports, run.environment, self.env_kwargs, self.env_wrapper, steps)
 
     def training_env(self, trained: int = 0) -> VecEnv:
         """Environments that are truncated at the checkpoints after so many environment steps of training."""
@@ -306,6 +326,7 @@ def _train(
         )
 
         def report() -> bool:
+            model.dump_logs()  # as SB3 does every fourth episode: TensorBoard has a point for each evaluation, the last too
             write_curve(folder / CURVE, evaluations.curve)
             goes_on = on_evaluation is None or on_evaluation(evaluations.curve) is not False
             return goes_on and not (folder / STOP).exists()
