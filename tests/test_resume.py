@@ -27,6 +27,7 @@ from search.training.run import Run, prepare_run, train
 HYPER: dict[str, Any] = {"env_kwargs": {}, **DENSE}
 PIXELS = {"pixels": True, "image_size": 16, "frame_stack": 2, "fast_rendering": True}
 CNN = {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8, "n_filters": 4}}
+SIMBA = {"net_arch": [8], "features_extractor_class": "simba", "features_extractor_kwargs": {"features_dim": 8}}
 # Episodes have 17, 25, 50 or up to 1000 agent steps: most are truncated at evaluations.
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "states": ("dm_control/cheetah-run-v0", {"env_kwargs": {"action_repeat": 40}}),
@@ -39,6 +40,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     # The second checkpoint lies between random actions.
     "noise": ("Pendulum-v1", {"use_sde": True, "sde_sample_freq": 4, "n_envs": 2, "normalize": {}, "learning_starts": 70}),
+    "simba": ("Pendulum-v1", {"policy_kwargs": SIMBA}),
 }
 # Agent steps between evaluations.
 EVERY = {case: 10 if case == "pixels" else 30 for case in CASES}
