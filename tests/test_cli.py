@@ -25,7 +25,6 @@ from typer.testing import CliRunner
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from search.cli.main import app
-from search.cli.options import ZOO
 from search.cli.search import progress_table
 from search.evolution.sampler import GenerationProgress
 from search.evolution.space import distributions, loss_to_params
@@ -33,6 +32,7 @@ from search.execution.driver import SearchProgress
 from search.execution.storage import open_storage
 from search.studies.config import load_config
 from search.training.run import Run
+from search.training.shipped import ZOO
 
 ROOT = Path(__file__).parent.parent
 runner = CliRunner(env={"COLUMNS": "200", "TERM": "dumb"})
@@ -158,7 +158,7 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
         (["Pendulum-v1", "--aux-loss", "curll"], "nearest: curl"),
         (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "position 10"),
         (["Pendulum-v1", "--steps", "3", "--evaluations", "5"], "too few"),
-        (["Pendulum-v1", "--config", "missing.yml"], "missing.yml: cannot be read"),
+        (["Pendulum-v1", "--config", "body/simbaa"], "nearest: body/simba"),
         (["CartPole-v1", "--steps", "1000"], "CartPole-v1 cannot be trained"),
     ],
     ids=["environment", "name", "notation", "steps", "file", "actions"],
@@ -383,8 +383,7 @@ def test_a_benchmark_grows_and_names_what_failed(folder: Path, executor: Executo
     assert "Failed: " not in run("benchmark", *options.split(), "--seeds", "0")
     output = run("benchmark", *options.split(), "--seeds", "0,1", code=1)
     assert output.count("Failed: ") == 2 and len(executor.runs) == 4
-    run("table", "bench", "--csv", "scores.csv", "--json", "all.json")
-    assert Path("scores.csv").exists() and json.loads(Path("all.json").read_text())
+    assert json.loads(run("table", "bench", "--csv", "scores.csv", "--json")) and Path("scores.csv").exists()
     assert "evaluations" in run("benchmark", *options.replace("200,400", "100,400").split(), "--seeds", "0", code=2)
     assert "--every" in run("benchmark", *options.split(), "--every", "20k,30k", code=2)
 

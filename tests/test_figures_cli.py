@@ -103,8 +103,7 @@ def texts(picture: Path) -> str:
 
 
 def test_analyze_writes_all_tables_as_data(study: optuna.Study) -> None:
-    run("analyze", "--json", "all.json", "--csv", "tables", "--pattern", "{s_t} -> {r_t}")
-    data = json.loads(Path("all.json").read_text())["one"]
+    data = json.loads(run("analyze", "--json", "--csv", "tables", "--pattern", "{s_t} -> {r_t}"))["one"]
     done = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
     for name, (source, target) in {"{s_t} -> {r_t}": ("s_t", "r_t"), "State reconstruction": ("s_t", "s_t")}.items():
         classes: dict[bool, list[float]] = {True: [], False: []}
@@ -132,8 +131,7 @@ def test_analyze_writes_all_tables_as_data(study: optuna.Study) -> None:
 
 
 def test_analyze_shows_whole_numbers_in_a_narrow_terminal(study: optuna.Study) -> None:
-    run("analyze", "--json", "all.json")
-    data = json.loads(Path("all.json").read_text())["one"]
+    data = json.loads(run("analyze", "--json"))["one"]
     shown = run("analyze", "runs/one")
     for row in data["table5"]:
         difference = re.escape(f"{row['difference']:+.2f}") + r"\*{0,2} "

@@ -1,9 +1,11 @@
 """What commands print: text, tables, progress."""
 
 import contextlib
-from collections.abc import Callable, Iterator
-from datetime import timedelta
-from typing import TYPE_CHECKING
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, RenderableType
 from rich.live import Live
@@ -13,9 +15,13 @@ from rich.table import Table
 if TYPE_CHECKING:
     import pandas as pd
 
+    from search.training.run import Run
+
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
-FOLDED = ("Loss", "variant")
+FOLDED = ("Loss", "variant", "notation")
+# Without a terminal: between two lines of progress in which nothing has changed.
+LINE_SECONDS = 600.0
 
 
 def say(text: object, style: str | None = None) -> None:
@@ -23,20 +29,29 @@ def say(text: object, style: str | None = None) -> None:
     console.print(str(text), style=style, markup=False, soft_wrap=True, highlight=False)
 
 
+def say_json(data: Any) -> None:
+    """Print plain values as JSON."""
+    say(json.dumps(data, indent=1))
+
+
 @contextlib.contextmanager
 def live() -> Iterator[Callable[[RenderableType, object], None]]:
-    """A function that shows progress: in place on a terminal, elsewhere as one more line where the state has changed."""
+    """
+    A function that shows progress: in place on a terminal; elsewhere, as in a job's log, as one more line with the time where
+    the state has changed, and every ten minutes.
+    """
     if console.is_terminal:
         with Live(console=console, refresh_per_second=2) as display:
             yield lambda shown, state: display.update(shown)
         return
     last: object = None
+    shown = -LINE_SECONDS
 
     def show(line: RenderableType, state: object) -> None:
-        nonlocal last
-        if state != last:
-            last = state
-            say(line)
+        nonlocal last, shown
+        if state != last or time.monotonic() - shown > LINE_SECONDS:
+            last, shown = state, time.monotonic()
+            say(f"{datetime.now():%H:%M:%S} {line}")
 
     yield show
 
@@ -66,3 +81,28 @@ def show_table(frame: "pd.DataFrame", title: str) -> None:
 def print_wide(table: Table) -> None:
     """Print a table as wide as it is."""
     Console(width=1000).print(table)
+
+
+def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
+    """Measure one run of each kind, and show what all of them would cost, beside each other where there are cores for them."""
+    import pandas as pd
+
+    from search.studies.cost import costs
+
+    if not kinds:
+        say("All runs are finished.")
+        return
+    found = costs(kinds)
+    formats = dict.fromkeys(("runs", "environment steps", "gradient steps"), "{:,}")
+    formats |= dict.fromkeys(("ms an environment step", "ms a gradient step", "hours of a run", "core hours"), "{:.3g}")
+    formats["MB of buffer"] = "{:,.1f}"
+    shown = pd.DataFrame({name: found[name].map(text.format) for name, text in formats.items()})
+    shown.insert(0, "", list(kinds))
+    show_table(shown, "Measured here")
+    n_runs = found["runs"].sum()
+    hours = (found["runs"] * found["hours of a run"]).sum() / min(workers, n_runs)
+    memory = found["MB of buffer"].max() * min(workers, n_runs)
+    say(
+        f"All: {n_runs} runs, {found['core hours'].sum():.3g} core hours; {hours:.3g} hours and at most {memory:,.1f} MB of "
+        f"buffers with --workers {workers}. Nothing was started."
+    )

@@ -2,7 +2,8 @@
 
 import signal
 import sys
-from typing import Any
+from importlib import metadata
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -40,6 +41,10 @@ def explain(error: Exception) -> str | None:
         module = (error.name or "").partition(".")[0]
         extra = "search" if module in OF_SEARCH else EXTRAS.get(module)
         return extra and f"{line}: pip install 'sb3-aarl[{extra}]'"
+    if "gymnasium" in sys.modules:
+        from gymnasium.error import Error
+
+        kinds.append(Error)  # such as one about a library that renders
     if "search.execution.storage" in sys.modules:
         from optuna.exceptions import StorageInternalError
         from sqlalchemy.exc import SQLAlchemyError
@@ -59,8 +64,19 @@ for group in (train, search, matrices, results):
 app.add_typer(figures.app, name="figures")
 
 
+def show_version(wanted: bool) -> None:
+    """Print the version, and end."""
+    if wanted:
+        print(metadata.version("sb3-aarl"))
+        raise typer.Exit
+
+
 @app.callback()
-def program() -> None:
+def program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
     """Auxiliary losses for reinforcement learning: train with one, search for better ones."""
 
 

@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from search.cli.console import console, errors, live, say, show_table, time_to_go
-from search.cli.options import Folder, SearchFile, Storage, Threads, Workers, read_config, run_folder
+from search.cli.console import console, errors, live, say, show_costs, show_table, time_to_go
+from search.cli.options import SHIPPED, DryRun, Folder, SearchFile, Storage, Threads, Workers, read_config, run_folder
+from search.training.shipped import find_file
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from search.execution.matrix import Matrix
+    from search.training.run import Run
 
 
 app = typer.Typer()
@@ -36,6 +38,18 @@ def train_matrix(matrix: "Matrix", workers: int, retries: int = 3) -> None:
             bar.update(task, completed=progress.finished, rest=rest)
             line = f"{matrix.name}: {progress.finished}/{progress.total} runs, {rest}"
             show(bar if console.is_terminal else line, (progress.finished, progress.failed))
+
+
+def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
+    """The runs of a matrix that are not finished, by variant and environment."""
+    from search.execution.matrix import cell_folder, task_name
+    from search.training.run import is_finished
+
+    kinds: dict[str, list[Run]] = {}
+    for cell, run in matrix.runs.items():
+        if not is_finished(cell_folder(matrix.folder, cell)):
+            kinds.setdefault(f"{cell.variant}, {task_name(cell.environment)}", []).append(run)
+    return kinds
 
 
 def compare(matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str) -> "pd.DataFrame | None":
@@ -131,7 +145,11 @@ def cross_validate(
 @app.command()
 def benchmark(
     configs: Annotated[
-        list[Path], typer.Argument(help="Files of hyper-parameters, one for each variant, such as zoo_configs/aarl_state.yml.")
+        list[Path],
+        typer.Argument(
+            callback=lambda paths: [find_file(path) for path in paths],
+            help=f"Hyper-parameters, one for each variant: {SHIPPED}, such as aarl_state.",
+        ),
     ],
     envs: Annotated[
         str | None, typer.Option(help="Such as cheetah-run,Pendulum-v1. Default: those that all files have an entry for.")
@@ -153,6 +171,7 @@ def benchmark(
     folder: Annotated[
         Path, typer.Option(help="Folder of the benchmark; more variants, tasks and seeds may be added to it.")
     ] = Path("runs/benchmark"),
+    dry_run: DryRun = False,
 ) -> None:
     """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command resumes it."""
     from search.cli.results import show_benchmark
@@ -164,6 +183,9 @@ def benchmark(
     if len(between) != 1:
         raise ValueError(f"--every is one number of environment steps, not {every}")
     matrix = load_benchmark(configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder)
+    if dry_run:
+        show_costs(unfinished(matrix), workers)
+        return
     train_matrix(matrix, workers)
     show_benchmark(folder)
     exit_if_failed(matrix)

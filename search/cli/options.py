@@ -6,14 +6,34 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
+from search.training.shipped import find_file
+
 if TYPE_CHECKING:
     from optuna import Study
 
     from search.studies.config import SearchConfig
 
-ZOO = Path(__file__).parents[2] / "zoo_configs"
-
-SearchFile = Annotated[Path, Argument(help="Configuration of a search, such as zoo_configs/search/demo.yml.")]
+SearchFile = Annotated[
+    Path,
+    Argument(
+        callback=lambda path: find_file(path, searches=True),
+        help="Configuration of a search: a file, or one of `aarl configs` by name, such as demo.",
+    ),
+]
+SHIPPED = "a file, or one of `aarl configs` by name"
+DryRun = Annotated[
+    bool, Option("--dry-run", help="Start nothing: measure some steps here, and show what all runs would cost.")
+]
+Json = Annotated[bool, Option("--json", help="Print JSON instead.")]
+Model = Annotated[Path, Argument(help="Model of SACAux, such as model.zip, or the folder of a run that has one.")]
+ModelConfig = Annotated[
+    Path | None,
+    Option(
+        "--config",
+        callback=lambda path: path and find_file(path),
+        help=f"Whose env_kwargs count: {SHIPPED}. Default: what the model's run was trained with.",
+    ),
+]
 Folder = Annotated[Path | None, Option(help="Folder of the search. Default: runs/ and the name of the configuration file.")]
 Benchmark = Annotated[Path, Argument(help="Folder of a benchmark.")]
 SearchFolder = Annotated[
@@ -59,7 +79,9 @@ def search_folder(folder: Path | None, storage: str | None) -> Path | None:
     from search.execution.storage import STUDY_FILE
 
     if folder is not None:
-        return run_folder(folder, None) if folder.suffix in (".yml", ".yaml") else folder
+        named = run_folder(folder, None)
+        is_config = folder.suffix in (".yml", ".yaml") or (not folder.exists() and named.exists())
+        return named if is_config else folder
     if storage is not None:
         return None
     folders = sorted(path.parent for path in Path("runs").glob(f"*/{STUDY_FILE}"))

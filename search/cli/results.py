@@ -1,7 +1,8 @@
 """Commands that show what is stored and train nothing: table, analyze, report, dashboard."""
 
+import math
 from contextlib import suppress
-from json import dumps, loads
+from json import loads
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -9,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from search.cli import options
-from search.cli.console import console, print_wide, say, show_table
+from search.cli.console import console, print_wide, say, say_json, show_table, time_to_go
 from search.cli.options import Storage, open_studies, search_folder
 
 if TYPE_CHECKING:
@@ -42,21 +43,22 @@ def table(
         typer.Option("--table", help="Table of the paper. Default: that with most of the variants."),
     ] = None,
     csv: Annotated[Path | None, typer.Option(help="File to write the scores to, one line for each cell.")] = None,
-    json: Annotated[Path | None, typer.Option(help="File to write all that is shown to, and every run.")] = None,
+    json: options.Json = False,
 ) -> None:
     """Show a benchmark beside the paper's tables, with interquartile means and probabilities of improvement."""
     show_benchmark(folder, None if number is None else int(number), csv, json)
 
 
-def show_benchmark(folder: Path, number: int | None = None, csv: Path | None = None, json: Path | None = None) -> None:
-    """Show the tables of a benchmark, and write them to files."""
+def show_benchmark(folder: Path, number: int | None = None, csv: Path | None = None, json: bool = False) -> None:
+    """Show the tables of a benchmark, as JSON with every run, and write its scores to a file."""
     from search.results import table as tables
 
     found = tables.read_tables(folder, number)
     if csv is not None:
         found.comparison.to_csv(csv, index=False)
-    if json is not None:
-        json.write_text(dumps(tables.as_data(found), indent=1) + "\n", encoding="utf-8")
+    if json:
+        say_json(tables.as_data(found))
+        return
     for shown in tables.terminal_tables(found):
         print_wide(shown)
     for line in tables.footnotes(found):
@@ -79,7 +81,7 @@ def analyze(
     pattern: options.Patterns = None,
     top: options.Top = 10,
     csv: Annotated[Path | None, typer.Option(help="Folder to write every table to, as NAME-TABLE.csv.")] = None,
-    json: Annotated[Path | None, typer.Option(help="File to write all tables to.")] = None,
+    json: options.Json = False,
 ) -> None:
     """Show what searches teach about losses: patterns (table 5), importances, effects, diversity, lineage, metrics."""
     from search.results import analysis
@@ -93,12 +95,13 @@ def analyze(
         for name, summary in summaries.items():
             for title, frame in summary.tables.items():
                 frame.to_csv(csv / f"{name.replace('/', '_')}-{title}.csv")
-    if json is not None:
+    if json:
         data = {
             name: {**{title: records(frame) for title, frame in tables.items()}, "problems": problems}
             for name, (tables, problems) in summaries.items()
         }
-        json.write_text(dumps(data, indent=1) + "\n", encoding="utf-8")
+        say_json(data)
+        return
     for name, summary in summaries.items():
         console.rule(escape(name))
         for title, heading in ANALYSES.items():
@@ -124,6 +127,61 @@ def patterns_by_name(others: list[str] | None) -> "dict[str, str | AuxLoss]":
 def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
     """The rows of a table in plain values for JSON, names of rows included."""
     return loads(frame.reset_index().to_json(orient="records", double_precision=15))
+
+
+@app.command()
+def status(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Folder of a search or a benchmark, or a search's file. Default: the only search.")
+    ] = None,
+    storage: Storage = None,
+    json: options.Json = False,
+) -> None:
+    """Show how far a search, what belongs to it, or a benchmark is: runs done, running, failed, best so far, time to go."""
+    import pandas as pd
+
+    from search.execution.storage import STUDY_FILE
+    from search.studies.status import PARTS, matrix_status, search_status
+
+    path = search_folder(folder, storage)
+    data: dict[str, Any] = {}
+    lines = []
+    rows: list[dict[Any, Any]] = []
+    if storage is not None or path is None or (path / STUDY_FILE).exists():
+        ((study, path),) = open_studies([folder], storage).values()
+        progress, runs = search_status(study, path)
+        data["search"] = {**progress._asdict(), "generations": [row._asdict() for row in progress.generations], "runs": runs}
+        rows += [
+            {"variant": f"generation {row.generation}", "runs": row.slots, "done": row.filled, **row._asdict()}
+            for row in progress.generations
+        ]
+        best = "nothing yet" if progress.best is None else f"{progress.best_loss}, score {progress.best:.2f}"
+        complete = all(row.filled == row.slots for row in progress.generations)
+        how = (
+            time_to_go(progress.seconds_to_go) if runs or complete else "no driver runs here: the same aarl search resumes it"
+        )
+        lines.append(f"Search: best {best}; {how}")
+    for part in ("", *PARTS):
+        found, to_go = matrix_status(path / part)
+        if not found.empty:
+            data[part or "benchmark"] = {"variants": records(found.set_index("variant")), "seconds_to_go": to_go}
+            rows += found.to_dict("records")
+            lines.append(f"{(part or 'benchmark').capitalize()}: {time_to_go(to_go)}")
+    if not rows:
+        raise ValueError(f"{path} has neither a search nor a benchmark")
+    if json:
+        say_json(data)
+        return
+    columns = ["variant", "runs", "done", "running", "failed", "score"]
+    shown = [{name: str(row.get(name, "")) for name in columns} | {"score": number(row.get("score"))} for row in rows]
+    show_table(pd.DataFrame(shown), str(path))
+    for line in lines:
+        say(line)
+
+
+def number(value: float | None) -> str:
+    """A score as it is shown."""
+    return "-" if value is None or math.isnan(value) else f"{value:.2f}"
 
 
 @app.command()

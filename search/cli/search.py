@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.table import Table
 
-from search.cli.console import console, live, say, time_to_go
-from search.cli.options import Folder, SearchFile, Storage, Threads, read_config, run_folder
+from search.cli.console import console, live, say, show_costs, time_to_go
+from search.cli.options import DryRun, Folder, SearchFile, Storage, Threads, read_config, run_folder
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -47,6 +47,7 @@ def search(
     gpus_per_run: Annotated[
         float | None, typer.Option(help="With Ray: GPUs of each run, such as 0.25.", min=0, show_default="0")
     ] = None,
+    dry_run: DryRun = False,
 ) -> None:
     """Search for losses by evolution. Ctrl-C stops it, the same command resumes it."""
     of_ray = {"ray-address": ray_address, "cpus-per-run": cpus_per_run, "gpus-per-run": gpus_per_run}
@@ -60,11 +61,15 @@ def search(
     from search.execution.storage import open_storage
     from search.results.dashboard import update_plots
     from search.results.report import stored_baselines
-    from search.studies.search import open_search, runs_of
+    from search.studies.search import all_runs, open_search, runs_of
     from search.training.provenance import hide_password
 
     logging.set_verbosity(logging.WARNING)
     settings = read_config(config, threads=threads, generations=generations, pruner=pruner)
+    at_once = workers or (settings.population_size * len(settings.seeds) if executor == "ray" else 1)
+    if dry_run:
+        show_costs({settings.name: all_runs(settings)}, at_once)
+        return
     path = run_folder(config, folder)
     opened = open_storage(path, storage)
     study, _ = open_search(settings, opened)
@@ -74,14 +79,12 @@ def search(
     if executor == "ray":
         from search.execution.ray import RayExecutor
 
-        workers = workers or settings.population_size * len(settings.seeds)
         running = RayExecutor(ray_address, 1 if cpus_per_run is None else cpus_per_run, gpus_per_run or 0)
     else:
-        workers = workers or 1
-        running = LocalExecutor(workers)
+        running = LocalExecutor(at_once)
     annotate = annotations(study, settings, path)
     progresses: Any = iter(
-        Driver(study, opened, runs_of(settings), running, path, workers, settings.retries, on_change=annotate)
+        Driver(study, opened, runs_of(settings), running, path, at_once, settings.retries, on_change=annotate)
     )
     with running, closing(progresses):
         shown = show_progress(progresses)

@@ -1,15 +1,22 @@
-"""Commands for one run: train with a loss, list the losses that have a name."""
+"""Commands for one run: train with a loss, list the losses that have a name; evaluate and film what was trained."""
 
+import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
-from search.cli.console import console, say
-from search.cli.options import ZOO
+from search.cli.console import console, print_wide, say, say_json, time_to_go
+from search.cli.options import SHIPPED, Json, Model, ModelConfig
+from search.training.shipped import find_file
+
+if TYPE_CHECKING:
+    from sb3_aarl.callbacks import Evaluation
 
 app = typer.Typer()
+FPS = 30  # pictures a second of a video
+ModelEnv = Annotated[str | None, typer.Argument(help="Environment. Default: that of the model's run.")]
 
 
 @app.command()
@@ -19,8 +26,9 @@ def train(
         str | None,
         typer.Option(help="Notation, name, YAML file of a winner, 'none' or 'auto'. Default: the file's, or auto."),
     ] = None,
-    config: Annotated[Path, typer.Option(help="File of hyper-parameters.", show_default="zoo_configs/aarl_state.yml")] = ZOO
-    / "aarl_state.yml",
+    config: Annotated[Path, typer.Option(callback=lambda path: find_file(path), help=f"Hyper-parameters: {SHIPPED}.")] = Path(
+        "aarl_state"
+    ),
     steps: Annotated[
         int | None, typer.Option(help="Environment steps (agent steps x action repeat). Default: the file's n_timesteps.")
     ] = None,
@@ -34,7 +42,21 @@ def train(
     from sb3_aarl.callbacks import aulc
     from search.studies.single import train_one
 
-    curve, path, was_finished = train_one(env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder)
+    started = time.monotonic()
+
+    def show(curve: "list[Evaluation]") -> None:
+        # A resumed run has evaluations of before; they are as far apart as those that follow.
+        nonlocal started
+        now = time.monotonic()
+        left, started = (evaluations - len(curve)) * (now - started), now
+        point = curve[-1]
+        say(f"{point.environment_steps:,} environment steps: {point.mean:.1f} ± {point.std:.1f}, {time_to_go(left)}")
+
+    # A job's log has no place for a bar.
+    bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
+    curve, path, was_finished = train_one(
+        env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation
+    )
     table = Table("environment steps", "mean return", "deviation", "seconds", title=f"AULC {aulc(curve):.1f}")
     for column in table.columns:
         column.justify = "right"
@@ -47,15 +69,108 @@ def train(
 
 
 @app.command()
-def losses(published: Annotated[bool, typer.Option("--published", help="The paper's candidates too.")] = False) -> None:
+def losses(
+    published: Annotated[bool, typer.Option("--published", help="The paper's candidates too.")] = False, json: Json = False
+) -> None:
     """List the losses that have a name."""
     from sb3_aarl import catalog
 
+    names = [*catalog.names(), *(candidate.name for candidate in catalog.published() if published)]
+    found = {name: catalog.load(name) for name in names}
+    if json:
+        say_json({name: str(loss) for name, loss in found.items()})
+        return
     table = Table("name", "notation", "operator")
     table.columns[1].overflow = "fold"
-    for name in [*catalog.names(), *(candidate.name for candidate in catalog.published() if published)]:
-        loss = catalog.load(name)
+    for name, loss in found.items():
         operator = f"{loss.operator}, negatives" if loss.negatives else loss.operator
         # The brackets behind a notation hold the operator; rich would take them for markup.
         table.add_row(name, str(loss).partition(" [")[0], operator)
     console.print(table)
+
+
+@app.command()
+def configs(json: Json = False) -> None:
+    """List the configurations that come with the package, for commands that take a file."""
+    from search.training.shipped import shipped_files
+
+    kinds = {"Hyper-parameters: aarl train --config NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
+    found = {
+        title: {name: path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for name, path in files.items()}
+        for title, files in ((title, shipped_files(searches)) for title, searches in kinds.items())
+    }
+    if json:
+        say_json({title.partition(":")[0].lower(): names for title, names in found.items()})
+        return
+    for title, names in found.items():
+        table = Table("name", "what it is", title=title, title_justify="left")
+        for row in names.items():
+            table.add_row(*row)
+        print_wide(table)
+
+
+@app.command()
+def init(path: Annotated[Path, typer.Argument(help="File to write, such as own.yml.")]) -> None:
+    """Write the configuration of a search on an environment of your own, with comments, to edit."""
+    with path.open("x", encoding="utf-8") as file:
+        file.write(find_file(Path("template"), searches=True).read_text(encoding="utf-8"))
+    say(f"{path}: a search on Pendulum-v1, to edit. What it costs: aarl search {path} --dry-run")
+
+
+@app.command()
+def evaluate(
+    model: Model,
+    env: ModelEnv = None,
+    config: ModelConfig = None,
+    episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 10,
+    seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
+    json: Json = False,
+) -> None:
+    """Show the return of a trained model: mean and deviation of episodes with its best actions."""
+    import numpy as np
+
+    returns = play(model, env, config, episodes, seed)
+    if json:
+        say_json({"mean": float(np.mean(returns)), "std": float(np.std(returns)), "returns": returns})
+    else:
+        say(f"{np.mean(returns):.1f} ± {np.std(returns):.1f}, mean and deviation of {episodes} episodes")
+
+
+@app.command()
+def video(
+    model: Model,
+    env: ModelEnv = None,
+    config: ModelConfig = None,
+    episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help=".gif, or .mp4 (pip install imageio-ffmpeg). Default: video.gif beside the model.")
+    ] = None,
+) -> None:
+    """Film a trained model."""
+    import imageio.v3 as imageio
+
+    path = out or (model if model.is_dir() else model.parent) / "video.gif"
+    frames: list[Any] = []
+    returns = play(model, env, config, episodes, seed, frames)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # GIF counts in milliseconds, and repeats.
+    imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix == ".gif" else {"fps": FPS}))
+    say(f"Video: {path}, {len(frames)} pictures, returns {', '.join(f'{value:.1f}' for value in returns)}")
+
+
+def play(
+    model: Path, env: str | None, config: Path | None, episodes: int, seed: int, frames: list[Any] | None = None
+) -> list[float]:
+    """The returns of a model's episodes, and, where wanted, their pictures."""
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    from search.studies.single import load_trained
+
+    trained, environment = load_trained(model, env, config, renders=frames is not None)
+    environment.seed(seed)
+    film = None if frames is None else lambda *_: frames.append(environment.render())
+    returns, _ = evaluate_policy(trained, environment, episodes, callback=film, return_episode_rewards=True)
+    environment.close()
+    assert isinstance(returns, list)
+    return [float(value) for value in returns]

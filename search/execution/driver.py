@@ -135,7 +135,7 @@ class Driver:
                     self._check(running)
                 while self._has_room() and self._patiently(self.sampler.free_slots, self.study) > 0:
                     self._start(self._patiently(self._ask))
-                yield self._patiently(self._progress)
+                yield self._patiently(search_progress, self.study, self.sampler)
                 if not self.running and self._patiently(self.sampler.is_complete, self.study):
                     return
                 time.sleep(POLL_SECONDS)
@@ -238,19 +238,21 @@ class Driver:
         self._patiently(self.study.tell, trial, values, state, skip_if_finished=True)
         self.running.pop(trial.number, None)
 
-    def _progress(self) -> SearchProgress:
-        generations = self.sampler.progress(self.study)
-        complete = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        best = self.study.best_trial if complete else None
-        seconds = [trial.duration.total_seconds() for trial in complete if trial.duration is not None]
-        left = sum(generation.slots - generation.filled for generation in generations)
-        at_once = max(1, len(self.running))
-        return SearchProgress(
-            generations,
-            None if best is None else best.value,
-            None if best is None else str(loss_of(best)),
-            float(np.mean(seconds)) * left / at_once if seconds else None,
-        )
+
+def search_progress(study: optuna.Study, sampler: AuxLossSampler) -> SearchProgress:
+    """How far a search is."""
+    generations = sampler.progress(study)
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    best = study.best_trial if complete else None
+    seconds = [trial.duration.total_seconds() for trial in complete if trial.duration is not None]
+    left = sum(generation.slots - generation.filled for generation in generations)
+    at_once = max(1, sum(generation.running for generation in generations))
+    return SearchProgress(
+        generations,
+        None if best is None else best.value,
+        None if best is None else str(loss_of(best)),
+        float(np.mean(seconds)) * left / at_once if seconds else None,
+    )
 
 
 def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:

@@ -23,6 +23,7 @@ from search.evolution.space import MAX_HORIZON, loss_to_params
 from search.training import config as training
 from search.training.config import ConfigError
 from search.training.run import checkpoint_interval
+from search.training.shipped import find_file
 
 
 def _ascending(steps: tuple[int, ...]) -> tuple[int, ...]:
@@ -92,7 +93,8 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     :param path: The file that it was read from
     :param imports: Modules that are imported first, such as those that register environments
     :param environment: Id of the environment, or the short form of a DeepMind Control task
-    :param hyperparameters: File of hyper-parameters for ``load_hyperparameters``, relative to the file of the search
+    :param hyperparameters: File of hyper-parameters for ``load_hyperparameters``, relative to the file of the search, or the
+        name of a shipped one; None for SACAux's defaults
     :param checkpoints: Environment steps of the evaluations, ascending; the last one ends the run
     :param evaluation_episodes: Episodes of each evaluation
     :param generations: Number of generations of the evolution (the paper's "stages")
@@ -113,7 +115,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     path: Annotated[Path, AfterValidator(Path.absolute)]
     imports: Annotated[tuple[str, ...], AfterValidator(training.import_modules)] = ()
     environment: Environment
-    hyperparameters: Path
+    hyperparameters: Path | None = None
     checkpoints: Checkpoints
     evaluation_episodes: PositiveInt = 10
     generations: PositiveInt = 7
@@ -142,8 +144,8 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
 
     @field_validator("hyperparameters")
     @classmethod
-    def _relative_to_the_file(cls, path: Path, info: ValidationInfo) -> Path:
-        return info.data["path"].parent / path
+    def _relative_to_the_file(cls, path: Path | None, info: ValidationInfo) -> Path | None:
+        return path and find_file(path, folder=info.data["path"].parent)
 
     @field_validator("initial", mode="plain")
     @classmethod
@@ -174,7 +176,8 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
 
     def hyperparameters_for(self, environment: str, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """The hyper-parameters of a run on an environment, with overrides such as those of a baseline merged over them."""
-        merged = training.merge(training.load_hyperparameters(self.hyperparameters, environment), self.overrides)
+        settings = {} if self.hyperparameters is None else training.load_hyperparameters(self.hyperparameters, environment)
+        merged = training.merge(settings, self.overrides)
         return training.check_hyperparameters(training.merge(merged, overrides or {}), environment, f"{self.path}: overrides")
 
     def checkpoints_for(self, environment: str) -> tuple[int, ...]:

@@ -55,6 +55,13 @@ def runs_of(config: SearchConfig) -> Callable[[AuxLoss], list[Run]]:
     return make_runs
 
 
+def all_runs(config: SearchConfig) -> list[Run]:
+    """A run for each candidate and seed of a search that never fails, all with SACAux's own loss: what it would cost."""
+    operations = AuxLossSampler(**config.sampler_settings()).operations
+    run = make_run(config, config.environment, None, config.seeds[0]).model_copy(update={"aux_loss": "auto"})
+    return [run] * sum(len(operations(number + 1)) for number in range(config.generations)) * len(config.seeds)
+
+
 def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Study, AuxLossSampler]:
     """
     Create or load the study of a search, with its sampler.

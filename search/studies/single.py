@@ -1,14 +1,40 @@
-"""One training run by hand, behind ``aarl train``: it keeps the model."""
+"""One training run by hand, behind ``aarl train``: it keeps the model; and what is done with such a model."""
 
 import hashlib
 import re
+from collections.abc import Callable
 from pathlib import Path
 
-from sb3_aarl import catalog
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_aarl import SACAux, catalog
 from sb3_aarl.callbacks import Evaluation
 from sb3_aarl.envs import PREFIX
-from search.training.config import ConfigError, action_repeat, load_aux_loss, load_hyperparameters, resolve_env_id
-from search.training.run import Run, check_run, checkpoint_interval, is_finished, prepare_run, spread_checkpoints, train
+from search.training.config import (
+    ConfigError,
+    action_repeat,
+    import_modules,
+    load_aux_loss,
+    load_hyperparameters,
+    resolve_env_id,
+)
+from search.training.run import (
+    MODEL,
+    NORMALIZE,
+    RUN,
+    Run,
+    check_run,
+    checkpoint_interval,
+    is_finished,
+    make_env,
+    prepare_run,
+    read_run,
+    spread_checkpoints,
+    train,
+)
+
+VIDEO_SIZE = 320  # pixels, height and width
 
 
 def train_one(
@@ -21,9 +47,11 @@ def train_one(
     seed: int = 0,
     threads: int = 1,
     folder: str | Path | None = None,
+    progress_bar: bool = True,
+    on_evaluation: Callable[[list[Evaluation]], bool | None] | None = None,
 ) -> tuple[list[Evaluation], Path, bool]:
     """
-    Train with one loss in this process, with a progress bar, and keep model, learning curve and ``provenance.json``.
+    Train with one loss in this process, and keep model, learning curve and ``provenance.json``.
 
     :param environment: Id of the environment, or the short form of a DeepMind Control task
     :param aux_loss: Notation, name, or YAML file of ``load_aux_loss``; ``"none"`` for none; None for what the file of
@@ -31,6 +59,7 @@ def train_one(
     :param config: File of hyper-parameters
     :param environment_steps: Environment steps of the run, None for the file's ``n_timesteps``
     :param folder: Folder of the run, None for one in ``runs`` named after environment, loss and settings
+    :param on_evaluation: Called with the curve so far after each evaluation
     :return: The learning curve, the folder, and whether the run was finished before
     :raises ValueError: when something is unknown or does not fit, or the folder has another run
     """
@@ -66,4 +95,37 @@ def train_one(
     check_run(run)
     prepare_run(folder, run)
     was_finished = is_finished(folder)
-    return train(folder, progress_bar=True), folder, was_finished
+    return train(folder, progress_bar, on_evaluation), folder, was_finished
+
+
+def load_trained(
+    path: Path, environment: str | None = None, config: Path | None = None, renders: bool = False
+) -> tuple[SACAux, VecEnv]:
+    """
+    A trained model, and an environment for it: that of the run that it is from, or another one.
+
+    :param path: Folder of a run with its model, or the file of a model
+    :param environment: Id or short form; None for that of the run
+    :param config: File of hyper-parameters whose ``env_kwargs`` count; None for those of the run, if there is one
+    :param renders: Whether the environment renders
+    :raises ValueError: when there is no model, or the environment is not known
+    """
+    folder = path if path.is_dir() else path.parent
+    model = folder / MODEL if path.is_dir() else path
+    if not model.is_file():
+        raise ValueError(f"{model} does not exist: name a model, or the folder of a run that has one, such as of aarl train")
+    run = read_run(folder) if (folder / RUN).exists() else None
+    if run is not None:
+        import_modules(run.imports)
+    if environment is None and run is None:
+        raise ValueError(f"which environment? {folder} has no {RUN} that names it")
+    env_id = resolve_env_id(environment) if environment is not None else run.environment  # type: ignore[union-attr]
+    settings = load_hyperparameters(config, env_id) if config is not None else run.hyperparameters if run is not None else {}
+    env_kwargs = settings.get("env_kwargs") or {}
+    if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
+        env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}
+    env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, renders))
+    if (folder / NORMALIZE).exists():
+        env = VecNormalize.load(str(folder / NORMALIZE), env)
+        env.training = env.norm_reward = False
+    return SACAux.load(model, env), env

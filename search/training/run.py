@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 RUN = "run.json"
 CURVE = "curve.csv"
 MODEL = "model.zip"
+NORMALIZE = "vecnormalize.pkl"
 FAILED = "failed.json"
 STOP = "stop"
 LOCK = "lock"
@@ -148,11 +149,14 @@ def differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, Any,
         yield key, one, other
 
 
-def make_env(env_id: str, env_kwargs: Mapping[str, Any]) -> gym.Env:
-    """An environment with the ``env_kwargs`` of a configuration: of ``make_dmc_env``, or of ``wrap_env`` for any other id."""
+def make_env(env_id: str, env_kwargs: Mapping[str, Any], renders: bool = False) -> gym.Env:
+    """
+    An environment with the ``env_kwargs`` of a configuration: of ``make_dmc_env``, or of ``wrap_env`` for any other id.
+    ``renders`` has it render if it observes no pixels, too.
+    """
     if env_id.startswith(PREFIX):
         return make_dmc_env(env_id, **env_kwargs)
-    arguments: dict[str, Any] = {"render_mode": "rgb_array"} if env_kwargs.get("pixels") else {}
+    arguments: dict[str, Any] = {"render_mode": "rgb_array"} if renders or env_kwargs.get("pixels") else {}
     return wrap_env(gym.make(env_id, **arguments), **env_kwargs)
 
 
@@ -187,7 +191,7 @@ def _make_in_process(
     return checkpoint.TruncateAt(env, steps)
 
 
-class _Setup:
+class Setup:
     """What a run is trained with; its settings are from ``source``, in messages."""
 
     def __init__(self, run: Run, source: str):
@@ -222,6 +226,7 @@ class _Setup:
         self.settings = settings | {"aux_loss": run.aux_loss, "seed": run.seed}
 
         limit = EPISODE_LENGTH if run.environment.startswith(PREFIX) else gym.spec(run.environment).max_episode_steps
+        self.episode_steps = limit
         apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
         if limit is not None and apart < limit * self.n_envs:
             message = "evaluations are %d environment steps apart, and truncate episodes, which may have %d"
@@ -256,8 +261,8 @@ def check_run(run: Run) -> None:
     :raises ConfigError: in one line, when they cannot be made of its settings
     """
     try:
-        setup = _Setup(run, run.environment)
-        with _closing(setup.training_env()) as env:
+        setup = Setup(run, run.environment)
+        with closing_env(setup.training_env()) as env:
             setup.model(env)
     except ConfigError:
         raise
@@ -266,7 +271,7 @@ def check_run(run: Run) -> None:
 
 
 @contextlib.contextmanager
-def _closing(env: VecEnv) -> Iterator[VecEnv]:
+def closing_env(env: VecEnv) -> Iterator[VecEnv]:
     try:
         yield env
     finally:
@@ -310,11 +315,11 @@ def _train(
     folder: Path, run: Run, progress_bar: bool, on_evaluation: Callable[[list[Evaluation]], bool | None] | None
 ) -> None:
     th.set_num_threads(run.threads)
-    setup = _Setup(run, str(folder / RUN))
+    setup = Setup(run, str(folder / RUN))
     state = checkpoint.read(folder)
     curve = [Evaluation(*row) for row in state["curve"]] if state else []
     trained = curve[-1].environment_steps if curve else 0
-    with _closing(setup.training_env(trained)) as env, _closing(setup.evaluation_env()) as evaluation_env:
+    with closing_env(setup.training_env(trained)) as env, closing_env(setup.evaluation_env()) as evaluation_env:
         model = setup.model(env)
         evaluations = LearningCurveCallback(
             evaluation_env,
@@ -339,6 +344,8 @@ def _train(
             if run.keep_model:
                 unfinished = folder / f"unfinished-{MODEL}"
                 model.save(unfinished)
+                if isinstance(env, VecNormalize):
+                    env.save(str(folder / NORMALIZE))
                 unfinished.replace(folder / MODEL)
             write_about(folder, {**read_about(folder), "seconds": evaluations.curve[-1].seconds})
             report()

@@ -1,0 +1,63 @@
+"""What runs would cost on this machine, measured on one of each kind."""
+
+import time
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+import torch as th
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
+from sb3_aarl.buffers import ARRAYS, WindowReplayBuffer
+from search.training.run import Run, Setup, closing_env
+
+MEASURED_SECONDS = 2.0
+MEASURED_STEPS = 50  # at least, so that there are windows
+# Of environments that name none.
+EPISODE_STEPS = 1000
+
+
+def measure(run: Run) -> dict[str, float]:
+    """Train a run for some seconds, and return what all of it, its evaluations included, would take here."""
+    th.set_num_threads(run.threads)
+    setup = Setup(run, run.environment)
+    with closing_env(setup.training_env()) as env:
+        model = setup.model(env)
+        learning_starts, gradient_steps = model.learning_starts, model.gradient_steps
+        model.learning_starts = MEASURED_STEPS - 2
+        model.learn(MEASURED_STEPS)  # the first of everything is slow
+        model.learning_starts = model.gradient_steps = 0  # actions of the policy, and no training
+        started = time.monotonic()
+        model.learn(10**9, lambda *_: time.monotonic() - started < MEASURED_SECONDS)  # type: ignore[arg-type]
+        agent_step = (time.monotonic() - started) / model.num_timesteps
+        n, started = 0, time.monotonic()
+        while time.monotonic() - started < MEASURED_SECONDS:
+            model.train(1, model.batch_size)
+            n += 1
+        gradient_step = (time.monotonic() - started) / n
+        episode = (setup.episode_steps or EPISODE_STEPS) / setup.action_repeat
+        assert isinstance(model.train_freq, TrainFreq)
+        frequency, unit = model.train_freq
+        rollout = frequency * env.num_envs * (episode if unit == TrainFrequencyUnit.EPISODE else 1)
+        n_updates = max(0, setup.agent_steps - learning_starts) * (1 if gradient_steps < 0 else gradient_steps / rollout)
+        evaluated = len(run.checkpoints) * run.evaluation_episodes * episode
+        buffer = model.replay_buffer
+        assert isinstance(buffer, WindowReplayBuffer)
+        arrays = [*(store.frames for store in buffer.stores.values()), *(getattr(buffer, name) for name in ARRAYS)]
+        share = min(1.0, setup.agent_steps / buffer.buffer_size / env.num_envs)  # it takes memory as it fills
+    return {
+        "environment steps": run.checkpoints[-1],
+        "ms an environment step": 1000 * agent_step / setup.action_repeat,
+        "gradient steps": round(n_updates),
+        "ms a gradient step": 1000 * gradient_step,
+        "hours of a run": ((setup.agent_steps + evaluated) * agent_step + n_updates * gradient_step) / 3600,
+        "MB of buffer": share * sum(array.nbytes for array in arrays) / 1e6,
+    }
+
+
+def costs(kinds: Mapping[str, Sequence[Run]]) -> pd.DataFrame:
+    """One row for each kind of runs: ``runs``, what :func:`measure` returns of the first one, and ``core hours`` of all."""
+    rows = []
+    for runs in kinds.values():
+        cost = measure(runs[0])
+        rows.append({"runs": len(runs), **cost, "core hours": len(runs) * cost["hours of a run"] * runs[0].threads})
+    return pd.DataFrame(rows)

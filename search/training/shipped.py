@@ -1,0 +1,41 @@
+"""The files of ``zoo_configs/`` by name."""
+
+import difflib
+from pathlib import Path
+
+ZOO = Path(__file__).parents[2] / "zoo_configs"
+SEARCHES = ZOO / "search"
+
+
+def shipped_files(searches: bool) -> dict[str, Path]:
+    """
+    The shipped files by name, such as ``aarl_state`` or ``body/simba``.
+
+    :param searches: Whether to return configurations of searches, or files of hyper-parameters
+    """
+    folder = SEARCHES if searches else ZOO
+    files = [path for path in sorted(folder.rglob("*.yml")) if searches or SEARCHES not in path.parents]
+    return {path.relative_to(folder).with_suffix("").as_posix(): path for path in files}
+
+
+def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path:
+    """
+    A file that is there, or else the shipped one of that name: ``demo``, ``body/simba``, ``simba``,
+    ``zoo_configs/body/simba.yml``.
+
+    :param path: Path or name
+    :param searches: Whether it is the configuration of a search, or a file of hyper-parameters
+    :param folder: What the path is relative to
+    :raises ValueError: with the nearest name, when there is no such file
+    """
+    if (folder / path).is_file():
+        return folder / path
+    files = shipped_files(searches)
+    wanted = f"/{path.as_posix().removesuffix('.yml')}"
+    found = [
+        known for known, file in files.items() if f"/zoo_configs/{file.relative_to(ZOO).with_suffix('')}".endswith(wanted)
+    ]
+    if len(found) != 1:
+        nearest = found or difflib.get_close_matches(path.stem, files, n=1, cutoff=0.0)
+        raise ValueError(f"{path} is no file, nor the name of one of `aarl configs`, nearest: {', '.join(nearest)}")
+    return files[found[0]]
