@@ -1,8 +1,8 @@
 """
 A search for losses on an environment of one's own, from Python, with an executor of one's own.
 
-One sees which runs start, how far each generation is, and the best loss: six runs, TIME on two cores. Scores of such
-short runs mean little. The same command resumes the search; `aarl dashboard runs/examples/search` shows it.
+One sees which runs start, how far each generation is, and the best loss: six runs, one to two minutes on two cores. Scores of
+so short runs mean little. The same command resumes the search; `aarl dashboard runs/examples/search` shows it.
 
     python examples/search_from_python.py
 """
@@ -53,7 +53,7 @@ def main(steps: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("--steps", type=int, default=2_000, help="steps of each run")
+    parser.add_argument("--steps", type=int, default=1_000, help="steps of each run")
     main(parser.parse_args().steps)
 else:
     gym.register(ENVIRONMENT, ENTRY_POINT, max_episode_steps=200, kwargs={"g": 3.7})
