@@ -1,0 +1,75 @@
+"""What a user gets: a core that needs no extra, an sdist with everything, a package for OptunaHub."""
+
+import shutil
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+import sb3_aarl
+
+ROOT = Path(__file__).parent.parent
+# Modules of the extras. The import system takes None for one that is not there.
+BARE = """
+import sys
+extras = "dm_control dm_env imageio matplotlib mujoco optuna packaging pandas scipy shimmy sklearn"
+sys.modules.update(dict.fromkeys(extras.split()))
+"""
+
+
+def python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
+
+
+def test_without_extras_an_agent_is_trained(tmp_path: Path) -> None:
+    agent = "from sb3_aarl import SACAux\nSACAux('MlpPolicy', 'Pendulum-v1', aux_loss='forward-dynamics').learn(110)\n"
+    program = "from search.cli.main import app\napp('train Pendulum-v1 --steps 40 --evaluations 1 --episodes 1'.split())"
+    ran = python(BARE + agent + program, tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert list(tmp_path.rglob("model.zip"))
+
+
+@pytest.mark.parametrize(
+    ("code", "extra"),
+    [
+        ("from sb3_aarl.envs import make_dmc_env\nmake_dmc_env('cheetah-run')", "dmc"),
+        ("from search.cli.main import app\napp(['train', 'cheetah-run'])", "dmc"),
+        ("from search.cli.main import app\napp(['search', 'demo'])", "search"),
+    ],
+)
+def test_what_needs_an_extra_names_it_in_one_line(code: str, extra: str, tmp_path: Path) -> None:
+    ran = python(BARE + code, tmp_path)
+    assert ran.returncode != 0
+    assert f"sb3-aarl[{extra}]" in ran.stderr.splitlines()[-1]
+    assert "make_dmc_env" in code or len(ran.stderr.splitlines()) == 1
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs a checkout")
+def test_the_sdist_has_every_file_of_the_checkout(tmp_path: Path) -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    files = {name for name in listed if (ROOT / name).is_file()} - {".gitignore"}
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    built = python("from setuptools.build_meta import build_sdist\nbuild_sdist('dist')", tmp_path)
+    assert built.returncode == 0, built.stderr
+    with tarfile.open(next((tmp_path / "dist").glob("*.tar.gz"))) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert files <= names
+
+
+def test_the_package_for_optunahub_finds_a_loss() -> None:
+    package = ROOT / "contrib/optunahub/package/samplers/aux_loss_sampler"
+    ran = subprocess.run([sys.executable, package / "example.py"], cwd=ROOT, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert "the best loss is {s_t, a_t} -> {s_t+1}" in ran.stdout
+    about = yaml.safe_load((package / "README.md").read_text(encoding="utf-8").split("---")[1])
+    assert about["license"] == "MIT License" and "sampler" in about["tags"]
+
+
+def test_the_citation_is_of_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == sb3_aarl.__version__
