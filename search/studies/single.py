@@ -124,7 +124,7 @@ def load_trained(
     env_kwargs = settings.get("env_kwargs") or {}
     if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
         env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}
-    env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, renders))
+    env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
     if (folder / NORMALIZE).exists():
         env = VecNormalize.load(str(folder / NORMALIZE), env)
         env.training = env.norm_reward = False

@@ -149,15 +149,19 @@ def differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, Any,
         yield key, one, other
 
 
-def make_env(env_id: str, env_kwargs: Mapping[str, Any], renders: bool = False) -> gym.Env:
+def make_env(env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any = None, renders: bool = False) -> gym.Env:
     """
-    An environment with the ``env_kwargs`` of a configuration: of ``make_dmc_env``, or of ``wrap_env`` for any other id.
-    ``renders`` has it render if it observes no pixels, too.
+    An environment with the ``env_kwargs`` of a configuration, of ``make_dmc_env``, or of ``wrap_env`` for any other id, and
+    its ``env_wrapper``. ``renders`` has it render if it observes no pixels, too.
     """
     if env_id.startswith(PREFIX):
-        return make_dmc_env(env_id, **env_kwargs)
-    arguments: dict[str, Any] = {"render_mode": "rgb_array"} if renders or env_kwargs.get("pixels") else {}
-    return wrap_env(gym.make(env_id, **arguments), **env_kwargs)
+        env = make_dmc_env(env_id, **env_kwargs)
+    else:
+        arguments: dict[str, Any] = {"render_mode": "rgb_array"} if renders or env_kwargs.get("pixels") else {}
+        env = wrap_env(gym.make(env_id, **arguments), **env_kwargs)
+    for module, name, wrapper_arguments in env_wrappers(env_wrapper):
+        env = getattr(importlib.import_module(module), name)(env, **wrapper_arguments)
+    return env
 
 
 def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
@@ -185,10 +189,7 @@ def _make_in_process(
     imports: Sequence[str], env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any, steps: Sequence[int]
 ) -> gym.Env:
     import_modules(imports)  # the process may be one of the environment alone
-    env = make_env(env_id, env_kwargs)
-    for module, name, arguments in env_wrappers(env_wrapper):
-        env = getattr(importlib.import_module(module), name)(env, **arguments)
-    return checkpoint.TruncateAt(env, steps)
+    return checkpoint.TruncateAt(make_env(env_id, env_kwargs, env_wrapper), steps)
 
 
 class Setup:
