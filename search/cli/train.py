@@ -26,9 +26,10 @@ def train(
         str | None,
         typer.Option(help="Notation, name, YAML file of a winner, 'none' or 'auto'. Default: the file's, or auto."),
     ] = None,
-    config: Annotated[Path, typer.Option(callback=lambda path: find_file(path), help=f"Hyper-parameters: {SHIPPED}.")] = Path(
-        "aarl_state"
-    ),
+    config: Annotated[
+        Path | None,
+        typer.Option(help=f"Hyper-parameters: {SHIPPED}. Default: aarl_state for DeepMind Control, default for others."),
+    ] = None,
     steps: Annotated[
         int | None, typer.Option(help="Environment steps (agent steps x action repeat). Default: the file's n_timesteps.")
     ] = None,
@@ -40,7 +41,9 @@ def train(
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.callbacks import aulc
+    from sb3_aarl.envs import PREFIX
     from search.studies.single import train_one
+    from search.training.config import resolve_env_id
 
     started = time.monotonic()
 
@@ -54,8 +57,10 @@ def train(
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
+    env = resolve_env_id(env)
+    file = find_file(config or Path("aarl_state" if env.startswith(PREFIX) else "default"))
     curve, path, was_finished = train_one(
-        env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation
+        env, aux_loss, file, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation
     )
     table = Table("environment steps", "mean return", "deviation", "seconds", title=f"AULC {aulc(curve):.1f}")
     for column in table.columns:
