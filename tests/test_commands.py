@@ -1,0 +1,246 @@
+"""Commands around a search and a run: shipped files by name, costs, status; evaluation and video of a model."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from filelock import FileLock
+from tiny import HYPERPARAMETERS, SEARCH, tiny_run, write_search
+from typer.testing import CliRunner
+
+import search.cli.console
+from sb3_aarl.callbacks import read_curve
+from search.cli.main import app
+from search.studies.config import load_config
+from search.training.run import prepare_run, train
+from search.training.shipped import ZOO, find_file, shipped_files
+
+runner = CliRunner(env={"COLUMNS": "200", "TERM": "dumb"})
+BASELINES = SEARCH + "baselines:\n- {name: SAC}\n- {name: CURL, aux_loss: curl}\n"
+# An environment of a user's own, whose reward is the action, and which renders.
+OWN_ENV = """\
+import gymnasium as gym
+import numpy as np
+
+
+class Own(gym.Env):
+    metadata = {"render_modes": ["rgb_array"]}
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32), {}
+
+    def step(self, action):
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32), float(action[0]), False, False, {}
+
+    def render(self):
+        return self.np_random.integers(0, 256, (32, 32, 3), np.uint8)
+
+
+gym.register("Own-v0", Own, max_episode_steps=20)
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the program runs."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    """What the program prints, which must end with an exit code; errors are one line."""
+    result = runner.invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, result.output
+    if code == 2:
+        assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+    return result.output
+
+
+@pytest.mark.parametrize(
+    ("name", "searches", "file"),
+    [
+        ("demo", True, "search/demo.yml"),
+        ("demo", False, "demo.yml"),
+        ("aarl_state.yml", False, "aarl_state.yml"),
+        ("body/simba", False, "body/simba.yml"),
+        ("simba", False, "body/simba.yml"),
+        ("zoo_configs/search/demo.yml", True, "search/demo.yml"),
+    ],
+)
+def test_shipped_files_have_names(name: str, searches: bool, file: str) -> None:
+    assert find_file(Path(name), searches) == ZOO / file
+
+
+def test_every_shipped_file_is_found_by_its_last_name() -> None:
+    for searches in (False, True):
+        for path in shipped_files(searches).values():
+            assert find_file(Path(path.stem), searches) == path
+
+
+def test_a_file_that_is_there_wins(folder: Path) -> None:
+    (folder / "demo").mkdir()  # a folder is none
+    assert find_file(Path("demo")) == ZOO / "demo.yml"
+    (folder / "aarl_state").write_text("default: {}")
+    assert find_file(Path("aarl_state")).samefile(folder / "aarl_state")
+    (folder / "elsewhere").mkdir()
+    assert find_file(Path("aarl_state"), folder=folder / "elsewhere") == ZOO / "aarl_state.yml"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "nearest"),
+    [
+        ("search dmo", "demo"),
+        ("baselines cheetah_run_sate", "cheetah_run_state"),
+        ("benchmark arl_state --envs cheetah-run", "aarl_state"),
+        ("train cheetah-run --config simbaa", "body/simba"),
+        ("evaluate model.zip --config aarl_pixl", "aarl_pixel"),
+    ],
+)
+def test_an_unknown_name_has_the_nearest(arguments: str, nearest: str) -> None:
+    assert run(*arguments.split(), code=2).endswith(f"nearest: {nearest}\n")
+    assert not Path("runs").exists()
+
+
+def test_a_search_may_name_a_shipped_file_or_none(folder: Path) -> None:
+    config = load_config(write_search(folder, SEARCH.replace("hyperparameters.yml", "sac_identity")))
+    assert config.hyperparameters == ZOO / "sac_identity.yml"
+    text = SEARCH.replace("hyperparameters: hyperparameters.yml\n", "overrides: {batch_size: 8}\n")
+    assert load_config(write_search(folder, text)).hyperparameters_for("Pendulum-v1") == {"batch_size": 8}
+
+
+def test_configs_lists_all_files_with_their_first_line() -> None:
+    shown, data = run("configs"), json.loads(run("configs", "--json"))
+    assert set(data["searches"]) == set(shipped_files(True)) and set(data["hyper-parameters"]) == set(shipped_files(False))
+    for name, line in {**data["searches"], **data["hyper-parameters"]}.items():
+        assert re.search(rf"{re.escape(name)} +│ +{re.escape(line)}", shown) and line
+
+
+@pytest.mark.slow
+def test_init_writes_a_search_that_runs_and_overwrites_nothing(folder: Path) -> None:
+    assert "own.yml" in run("init", "own.yml")
+    # One of a candidate's runs, shortened.
+    text = Path("own.yml").read_text().replace("[2000, 4000, 6000]", "[600, 1200]").replace("evaluation_episodes: 5", "")
+    Path("own.yml").write_text(text)
+    config = load_config("own.yml")
+    assert config.cross_validation and len(config.baselines) == 2
+    assert "own.yml" in run("init", "own.yml", code=2) and Path("own.yml").read_text() == text
+    assert "9 runs" in run("search", "own.yml", "--generations", 1, "--dry-run")
+
+
+@pytest.mark.slow
+def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path) -> None:
+    write_search(folder, SEARCH + "seeds: [0, 1]\n")
+    output = run("search", "small.yml", "--workers", 4, "--dry-run")
+    row = next(line for line in output.splitlines() if line.startswith("│ small"))
+    runs, steps, gradient_steps, step_ms, gradient_ms, hours, core_hours, _ = map(float, row.replace("│", "").split()[1:])
+    # 2 random ones and a prior, then 3; two seeds. Training begins after 40 steps.
+    assert (runs, steps, gradient_steps) == (12, 400, 360)
+    # And two evaluations of an episode of 200 steps.
+    assert hours == pytest.approx((800 * step_ms + 360 * gradient_ms) / 3.6e6, rel=0.05)
+    assert core_hours == pytest.approx(12 * hours, rel=0.05)
+    assert "All: 12 runs" in output and "with --workers 4" in output
+    assert not Path("runs").exists()
+
+
+@pytest.mark.slow
+def test_a_benchmark_costs_what_is_not_finished(folder: Path) -> None:
+    write_search(folder)
+    options = ["hyperparameters.yml", "--envs", "Pendulum-v1", "--checkpoints", "200", "--episodes", "1", "--folder", "bench"]
+    assert "All: 3 runs" in run("benchmark", *options, "--seeds", "0-2", "--dry-run")
+    assert not Path("bench").exists()
+    run("benchmark", *options, "--seeds", "0")
+    assert "All: 2 runs" in run("benchmark", *options, "--seeds", "0-2", "--dry-run")
+    assert "All runs are finished" in run("benchmark", *options, "--seeds", "0", "--dry-run")
+
+
+@pytest.mark.slow
+def test_status_of_a_search_and_its_baselines(folder: Path) -> None:
+    write_search(folder, BASELINES)
+    run("search", "small.yml", "--generations", 1, "--workers", 2)
+    shown, data = run("status", "small.yml"), json.loads(run("status", "runs/small", "--json"))
+    assert re.search(r"generation 1 +│ +3 │ +3 │ +0 │ +0 │", shown)
+    assert data["search"]["best_loss"] in shown and f"score {data['search']['best']:.2f}; 0:00:00 to go" in shown
+    run("baselines", "small.yml")
+    shown, data = run("status"), json.loads(run("status", "small", "--json"))
+    score = np.mean([point.mean for point in read_curve("runs/small/baselines/SAC/Pendulum-v1/seed-0/curve.csv")])
+    assert [row["variant"] for row in data["baselines"]["variants"]] == ["CURL", "SAC"]
+    assert re.search(rf"SAC +│ +1 │ +1 │ +0 │ +0 │ +{score:.2f} ", shown)
+
+
+def test_status_of_a_benchmark(folder: Path) -> None:
+    for seed, steps in enumerate([(200,), (200,), (200,)]):
+        path = Path(f"bench/some/Pendulum-v1/seed-{seed}")
+        prepare_run(path, tiny_run(seed=seed, checkpoints=steps))
+        (path / "provenance.json").write_text('{"variant": "some"}')
+    train(Path("bench/some/Pendulum-v1/seed-0"))
+    Path("bench/some/Pendulum-v1/seed-1/failed.json").write_text('{"reason": "it burst", "retry": false}')
+    with FileLock("bench/some/Pendulum-v1/seed-2/lock"):
+        shown = run("status", "bench")
+    assert re.search(r"some +│ +3 │ +1 │ +1 │ +1 │ +-\d+\.\d\d │", shown)
+    assert re.search(r"Benchmark: 0:00:\d\d to go", shown)
+    assert "neither" in run("status", "nowhere", code=2)
+
+
+def test_a_log_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def shown(show: Callable[[str, object], None]) -> list[str]:
+        for done in (1, 1, 2):
+            show(f"{done} done, 0:01:00 to go", done)
+        return [line.partition(" ")[2] for line in capsys.readouterr().out.splitlines()]
+
+    with search.cli.console.live() as show:
+        assert shown(show) == ["1 done, 0:01:00 to go", "2 done, 0:01:00 to go"]
+    monkeypatch.setattr(search.cli.console, "LINE_SECONDS", 0.0)
+    with search.cli.console.live() as show:
+        assert len(shown(show)) == 3
+
+
+def test_the_version() -> None:
+    assert re.fullmatch(r"\d+\.\d+\.\d+\n", run("--version"))
+
+
+@pytest.fixture
+def trained(folder: Path) -> Path:
+    """A run of 400 steps whose model was kept, with running statistics."""
+    (folder / "own_env.py").write_text(OWN_ENV)
+    settings = {**HYPERPARAMETERS, "normalize": True}
+    own = tiny_run(environment="Own-v0", imports=("own_env",), keep_model=True, checkpoints=(100,), hyperparameters=settings)
+    prepare_run(Path("trained"), own)
+    train(Path("trained"))
+    return Path("trained")
+
+
+def test_a_model_is_evaluated_as_in_its_run(trained: Path) -> None:
+    data = json.loads(run("evaluate", trained, "--episodes", 3, "--seed", 5, "--json"))
+    assert len(data["returns"]) == 3 and data["mean"] == pytest.approx(np.mean(data["returns"]))
+    assert data["std"] == pytest.approx(np.std(data["returns"]))
+    # The sum of the actions, not of normalized rewards.
+    (point,) = read_curve(trained / "curve.csv")
+    assert data["mean"] == pytest.approx(point.mean, abs=4)
+    shown = run("evaluate", trained / "model.zip", "Own-v0", "--episodes", 3, "--seed", 5)
+    assert shown.startswith(f"{data['mean']:.1f} ± {data['std']:.1f}")
+
+
+def test_a_video_of_a_model(trained: Path) -> None:
+    assert "20 pictures" in run("video", trained)
+    assert imageio.imread(trained / "video.gif", index=None).shape == (20, 32, 32, 3)
+    run("video", trained / "model.zip", "--out", "deep/film.mp4", "--episodes", 2)
+    assert imageio.improps("deep/film.mp4", plugin="FFMPEG").shape[1:] == (32, 32, 3)
+
+
+def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
+    assert "nowhere.zip does not exist" in run("evaluate", "nowhere.zip", code=2)
+    (trained / "model.zip").rename("alone.zip")
+    assert "which environment?" in run("evaluate", "alone.zip", code=2)
+    assert "spaces do not match" in run("evaluate", "alone.zip", "Pendulum-v1", code=2)
+    assert "model.zip does not exist" in run("video", trained, code=2)
