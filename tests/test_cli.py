@@ -30,7 +30,6 @@ from search.evolution.sampler import GenerationProgress
 from search.evolution.space import distributions, loss_to_params
 from search.execution.driver import SearchProgress
 from search.execution.storage import open_storage
-from search.studies.config import load_config
 from search.training.run import Run
 from search.training.shipped import ZOO
 
@@ -198,25 +197,6 @@ def test_all_files_are_installed() -> None:
     }
     there = {path for name in ("sb3_aarl", "search", "zoo_configs") for path in (ROOT / name).rglob("*") if path.is_file()}
     assert installed == {path for path in there if "__pycache__" not in path.parts}
-
-
-def test_the_readme_is_right(folder: Path) -> None:
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"`(\w+\.yml)`:\n\n```yaml\n(.*?)```", readme, flags=re.DOTALL)
-    assert [name for name, _ in blocks] == ["own.yml", "pendulum.yml"]
-    for name, text in blocks:
-        (folder / name).write_text(text)
-    config = load_config("pendulum.yml")
-    assert config.environment == "Pendulum-v1" and config.hyperparameters_for("Pendulum-v1")["batch_size"] == 128
-    assert config.hyperparameters_for("HalfCheetah-v5")["env_kwargs"] == {"action_repeat": 2}
-    # Every command that it names is there, with its options.
-    for command, options in re.findall(r"^    aarl (figures [\w-]+|[\w-]+)(.*)", readme, flags=re.MULTILINE):
-        described = run(*command.split(), "--help")
-        for option in re.findall(r"--[\w-]+", options.partition("#")[0].partition("&&")[0]):
-            assert option in described, (command, option)
-    # So is every name that it imports.
-    for text in re.findall(r"^from ((?:search|sb3_aarl)[\w.]* import .*)", readme, flags=re.MULTILINE):
-        exec(f"from {text}")
 
 
 def test_the_help_needs_nothing_heavy() -> None:
