@@ -5,6 +5,11 @@ RL-Zoo's own programs with SACAux, as ``sac_aux``, and with DeepMind Control as 
     python -m sb3_aarl.rl_zoo enjoy --algo sac_aux --env dm_control/cheetah-run-v0 -f logs
     python -m sb3_aarl.rl_zoo record_video --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
     python -m sb3_aarl.rl_zoo plot_train -a sac_aux -e dm_control/cheetah-run-v0 -f logs
+    python -m sb3_aarl.rl_zoo all_plots -a sac_aux sac -e dm_control/cheetah-run-v0 -f logs -o curves
+    python -m sb3_aarl.rl_zoo plot_from_file -i curves
+    python -m sb3_aarl.rl_zoo load_from_hub --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -orga NAME
+
+``--gym-packages my_envs`` imports modules that register environments, in every program that makes some.
 
 ``train -optimize`` samples what RL-Zoo samples for SAC, and ``policy_kwargs`` are RL-Zoo's own then, not the file's.
 
@@ -25,8 +30,13 @@ import yaml
 from sb3_aarl.envs import env_ids, make_dmc_env  # first: it chooses the renderer
 from sb3_aarl.sac_aux import SACAux
 
-# Each is a function of its own name in one of RL-Zoo's modules; record_video is a script.
-PROGRAMS = {"train": "rl_zoo3.train", "enjoy": "rl_zoo3.enjoy", "record_video": "", "plot_train": "rl_zoo3.plots"}
+# Functions in RL-Zoo's modules, each of its own name; the others are scripts. Two scripts are missing: record_training starts
+# processes of record_video, which do not know SACAux; push_to_hub of RL-Zoo 2.9.2 fails for all algorithms, as it imports a
+# function that sb3-team-hf-integration 3.2 does not have.
+FUNCTIONS = {"train": "rl_zoo3.train", "enjoy": "rl_zoo3.enjoy"} | dict.fromkeys(
+    ("plot_train", "all_plots", "plot_from_file"), "rl_zoo3.plots"
+)
+PROGRAMS = (*FUNCTIONS, "record_video", "load_from_hub")
 
 
 def register() -> None:
@@ -99,13 +109,20 @@ def main() -> None:
     arguments = sys.argv[2:]
     if program == "train":
         arguments = with_env_kwargs(arguments)
-    elif program == "plot_train":
-        # It looks for folders, in whose names RL-Zoo has a dash for the slash.
+    elif program == "record_video":
+        # RL-Zoo has this option for train and enjoy.
+        packages = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        packages.add_argument("--gym-packages", nargs="+", default=[])
+        known, arguments = packages.parse_known_args(arguments)
+        for name in known.gym_packages:
+            importlib.import_module(name)
+    elif program in ("plot_train", "all_plots"):
+        # They look for folders, in whose names RL-Zoo has a dash for the slash.
         arguments = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
     sys.argv = [f"{parser.prog} {program}", *arguments]
     try:
         register()
-        run = getattr(importlib.import_module(PROGRAMS[program]), program) if PROGRAMS[program] else None
+        run = getattr(importlib.import_module(FUNCTIONS[program]), program) if program in FUNCTIONS else None
     except ModuleNotFoundError as error:
         parser.error(f"{error}: pip install 'sb3-aarl[zoo]'")
     if run is None:

@@ -1,6 +1,7 @@
-"""RL-Zoo's own programs: train, enjoy, record_video and plot_train with SACAux and our files of hyper-parameters."""
+"""RL-Zoo's own programs with SACAux and our files of hyper-parameters."""
 
 import os
+import shutil
 import subprocess
 import sys
 from ast import literal_eval
@@ -37,11 +38,11 @@ def run(folder: Path, *command: str) -> str:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder where RL-Zoo trained for 280 agent steps, 20 of them with gradient steps, and evaluated once."""
+    """A folder where RL-Zoo trained for 280 agent steps, 20 of them with gradient steps, and evaluated twice."""
     pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
     folder = tmp_path_factory.mktemp("zoo")
     small = ["-params", "learning_starts:260", "batch_size:8", "buffer_size:500"]
-    settings = ["-n", "280", "--eval-freq", "270", "--eval-episodes", "1", "--device", "cpu", "--seed", "3", *small]
+    settings = ["-n", "280", "--eval-freq", "135", "--eval-episodes", "2", "--device", "cpu", "--seed", "3", *small]
     run(folder, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "aarl_state.yml"), *settings)
     return folder / "logs/sac_aux/dm_control-cheetah-run-v0_1"
 
@@ -60,15 +61,19 @@ def test_trains_with_the_hyperparameters_of_the_file(trained: Path) -> None:
     assert type(model.critic.features_extractor) is DenseMLP and model.critic.features_extractor.features_dim == 40
     # The action repeat of 4 in training and evaluation.
     assert list(load_results(str(trained)).l) == [250]
-    assert np.load(trained / "evaluations.npz")["ep_lengths"].tolist() == [[250]]
+    assert np.load(trained / "evaluations.npz")["ep_lengths"].tolist() == [[250, 250], [250, 250]]
 
 
 @pytest.mark.slow
-def test_enjoy_record_video_and_plot_train(trained: Path) -> None:
+def test_enjoy_record_video_and_plots(trained: Path) -> None:
     folder = trained.parents[2]
+    for i in (1, 2):  # plot_from_file needs two runs
+        shutil.copytree(trained, folder / "two/sac_aux" / trained.name.replace("_1", f"_{i}"))
     programs = [
         ["enjoy", *SAC_AUX, "-f", "logs", "-n", "260", "--no-render", "--device", "cpu", "--seed", "5"],
         ["record_video", *SAC_AUX, "-f", "logs", "-n", "3", "-o", "videos"],
+        ["all_plots", "-a", "sac_aux", "-e", TASK, "-f", "two", "-o", "curves", "--no-display"],
+        ["plot_from_file", "-i", "curves"],
         ["plot_train", "-a", "sac_aux", "-e", TASK, "-f", "logs", "-w", "1"],
     ]
     # In one process, as importing takes longer than all they do.
@@ -87,7 +92,55 @@ def test_enjoy_record_video_and_plot_train(trained: Path) -> None:
     assert truncated
     assert f"Episode Reward: {episode_reward:.2f}\nEpisode Length 250\n" in printed
     assert [path.suffix for path in (folder / "videos").iterdir()] == [".mp4"]
+    rows = [line.split("|")[1:-1] for line in printed.splitlines() if line.startswith("|dm_control-cheetah-run-v0")]
+    last = np.load(trained / "evaluations.npz")["results"][-1].mean()
+    assert [row[1].split("+/-")[0].strip() for row in rows] == [f"{last:.0f}"] * 2  # all_plots, plot_from_file
     assert printed.endswith("[1]\n")  # one curve, of one episode
+
+
+MY_ENVS = """
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.classic_control import PendulumEnv
+
+class Mine(PendulumEnv):
+    def render(self):
+        return np.zeros((64, 64, 3), np.uint8)
+
+gym.register("Mine-v0", Mine, max_episode_steps=20)
+"""
+SBX = """
+import rl_zoo3
+import rl_zoo3.train
+from rl_zoo3.train import train
+from sb3_aarl import SACAux
+
+rl_zoo3.ALGOS["sac_aux"] = SACAux
+rl_zoo3.train.ALGOS = rl_zoo3.ALGOS
+rl_zoo3.exp_manager.ALGOS = rl_zoo3.ALGOS
+train()
+"""
+SMALL = """
+default: {n_timesteps: 60, policy: MlpPolicy, learning_rate: lin_1e-3, learning_starts: 40, batch_size: 8,
+  normalize: "dict(norm_obs=True, norm_reward=False)", env_wrapper: [rl_zoo3.wrappers.HistoryWrapper: {horizon: 2}],
+  policy_kwargs: "dict(net_arch=[8])"}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", [["-m", "sb3_aarl.rl_zoo", "train"], ["own.py"]], ids=["ours", "three lines of SBX"])
+def test_an_environment_of_ones_own_needs_no_program(program: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
+    for name, text in (("my_envs.py", MY_ENVS), ("own.py", SBX), ("small.yml", SMALL)):
+        (tmp_path / name).write_text(text)
+    mine = ["--algo", "sac_aux", "--env", "Mine-v0", "--gym-packages", "my_envs"]
+    run(tmp_path, *program, *mine, "-conf", "small.yml", "--eval-freq", "-1", "--device", "cpu")
+    model = SACAux.load(tmp_path / "logs/sac_aux/Mine-v0_1/Mine-v0.zip", device="cpu")
+    assert model.num_timesteps == 60 and model._n_updates == 20 and model.observation_space.shape == (2 * 3 + 2,)
+    assert [model.lr_schedule(share) for share in (1, 0.5)] == [1e-3, 5e-4]
+    if program[0] == "-m":
+        run(tmp_path, "-m", "sb3_aarl.rl_zoo", "record_video", *mine, "-f", "logs", "-n", "3", "-o", "videos")
+        assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
 
 
 def added(arguments: list[str]) -> dict[str, object]:
