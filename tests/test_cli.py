@@ -18,7 +18,6 @@ import yaml
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState, create_trial
 from program import aarl, start
-from rich.console import Console
 from tiny import SEARCH, write_search
 from typer.testing import CliRunner
 
@@ -109,9 +108,6 @@ def executor(monkeypatch: pytest.MonkeyPatch) -> Executor:
     monkeypatch.setattr("search.execution.runs.LocalExecutor", executor)
     monkeypatch.setattr("search.execution.matrix.POLL_SECONDS", 0)
     monkeypatch.setattr("search.execution.driver.POLL_SECONDS", 0)
-    for module in ("search", "matrices"):
-        # A narrow one would break lines.
-        monkeypatch.setattr(f"search.cli.{module}.console", Console(width=200))
     return executor
 
 

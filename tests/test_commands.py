@@ -58,13 +58,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run(*arguments: object, code: int = 0) -> str:
+def run(*arguments: object, code: int = 0, stdout: bool = False) -> str:
     """What the program prints, which must end with an exit code; errors are one line."""
     result = runner.invoke(app, [str(argument) for argument in arguments])
     assert result.exit_code == code, result.output
     if code == 2:
         assert len(result.stderr.strip().splitlines()) == 1, result.stderr
-    return result.output
+    return result.stdout if stdout else result.output
 
 
 @pytest.mark.parametrize(
@@ -173,6 +173,7 @@ def test_status_of_a_search_and_its_baselines(folder: Path) -> None:
     assert data["search"]["best_loss"] in shown and f"score {data['search']['best']:.2f}; 0:00:00 to go" in shown
     run("baselines", "small.yml")
     shown, data = run("status"), json.loads(run("status", "small", "--json"))
+    assert set(json.loads(run("baselines", "small.yml", "--json", stdout=True))) == {"ranked", "others"}
     score = np.mean([point.mean for point in read_curve("runs/small/baselines/SAC/Pendulum-v1/seed-0/curve.csv")])
     assert [row["variant"] for row in data["baselines"]["variants"]] == ["CURL", "SAC"]
     assert re.search(rf"SAC +│ +1 │ +1 │ +0 │ +0 │ +{score:.2f} ", shown)
@@ -196,7 +197,7 @@ def test_a_log_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str], monke
     def shown(show: Callable[[str, object], None]) -> list[str]:
         for done in (1, 1, 2):
             show(f"{done} done, 0:01:00 to go", done)
-        return [line.partition(" ")[2] for line in capsys.readouterr().out.splitlines()]
+        return [line.partition(" ")[2] for line in capsys.readouterr().err.splitlines()]
 
     with search.cli.console.live() as show:
         assert shown(show) == ["1 done, 0:01:00 to go", "2 done, 0:01:00 to go"]

@@ -34,14 +34,19 @@ def say_json(data: Any) -> None:
     say(json.dumps(data, indent=1))
 
 
+def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
+    """The rows of a table in plain values for JSON, names of rows included."""
+    return json.loads(frame.reset_index().to_json(orient="records", double_precision=15))
+
+
 @contextlib.contextmanager
 def live() -> Iterator[Callable[[RenderableType, object], None]]:
     """
-    A function that shows progress: in place on a terminal; elsewhere, as in a job's log, as one more line with the time where
-    the state has changed, and every ten minutes.
+    A function that shows progress, on stderr: in place on a terminal; elsewhere, as in a job's log, as one more line with the
+    time where the state has changed, and every ten minutes.
     """
-    if console.is_terminal:
-        with Live(console=console, refresh_per_second=2) as display:
+    if errors.is_terminal:
+        with Live(console=errors, refresh_per_second=2) as display:
             yield lambda shown, state: display.update(shown)
         return
     last: object = None
@@ -51,7 +56,7 @@ def live() -> Iterator[Callable[[RenderableType, object], None]]:
         nonlocal last, shown
         if state != last or time.monotonic() - shown > LINE_SECONDS:
             last, shown = state, time.monotonic()
-            say(f"{datetime.now():%H:%M:%S} {line}")
+            errors.print(f"{datetime.now():%H:%M:%S} {line}", markup=False, highlight=False)
 
     yield show
 

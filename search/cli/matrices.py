@@ -5,10 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from search.cli.console import console, errors, live, say, show_costs, show_table, time_to_go
-from search.cli.options import SHIPPED, DryRun, Folder, SearchFile, Storage, Threads, Workers, read_config, run_folder
+from search.cli.console import errors, live, records, say, say_json, show_costs, show_table, time_to_go
+from search.cli.options import SHIPPED, DryRun, Folder, Json, SearchFile, Storage, Threads, Workers, read_config, run_folder
 from search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -22,22 +21,14 @@ app = typer.Typer()
 
 
 def train_matrix(matrix: "Matrix", workers: int, retries: int = 3) -> None:
-    """Train the runs of a matrix that are not finished, with a progress bar."""
+    """Train the runs of a matrix that are not finished, and show the progress."""
     from search.execution.matrix import run_matrix
     from search.execution.runs import LocalExecutor
 
-    bar = Progress(
-        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rest]}")),
-        console=console,
-        auto_refresh=False,
-    )
-    task = bar.add_task(matrix.name, total=len(matrix.runs), rest="")
     with LocalExecutor(workers) as executor, live() as show:
         for progress in run_matrix(matrix, executor, workers, retries):
-            rest = f"{progress.failed} failed, {time_to_go(progress.seconds_to_go)}"
-            bar.update(task, completed=progress.finished, rest=rest)
-            line = f"{matrix.name}: {progress.finished}/{progress.total} runs, {rest}"
-            show(bar if console.is_terminal else line, (progress.finished, progress.failed))
+            counts = f"{progress.finished}/{progress.total} runs, {progress.failed} failed"
+            show(f"{matrix.name}: {counts}, {time_to_go(progress.seconds_to_go)}", counts)
 
 
 def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
@@ -52,7 +43,9 @@ def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
     return kinds
 
 
-def compare(matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str) -> "pd.DataFrame | None":
+def compare(
+    matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str, json: bool
+) -> "pd.DataFrame | None":
     """Show a table of the variants that can be compared, and return it; show the scores of the others beside it."""
     from search.execution.matrix import comparable, scores
     from search.studies.cross_validation import ranking
@@ -61,6 +54,9 @@ def compare(matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", t
     compared = comparable(runs)
     others = runs.drop(compared.index)
     ranked = None if compared.empty else table(compared)
+    if json:
+        say_json({"ranked": [] if ranked is None else records(ranked), "others": records(ranking(others))})
+        return ranked
     if ranked is not None:
         show_table(texts(ranked), title)
     if not others.empty:
@@ -91,7 +87,9 @@ def exit_if_failed(matrix: "Matrix") -> None:
 
 
 @app.command()
-def baselines(config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None) -> None:
+def baselines(
+    config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
+) -> None:
     """Train the baselines of a search, which its candidates are compared with."""
     from search.studies import search
     from search.studies.cross_validation import ranking
@@ -101,19 +99,21 @@ def baselines(config: SearchFile, workers: Workers = 1, threads: Threads = None,
         raise ValueError(f"{config} names no baselines")
     matrix = search.baselines(settings, run_folder(config, folder))
     train_matrix(matrix, workers, settings.retries)
-    compare(matrix, ranking, "Baselines, AULC")
+    compare(matrix, ranking, "Baselines, AULC", json)
     exit_if_failed(matrix)
 
 
 @app.command()
-def select_operator(config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None) -> None:
+def select_operator(
+    config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
+) -> None:
     """Compare the ten operators on forward dynamics, as in the paper's table 2."""
     from search.studies import operator_selection
 
     settings = read_config(config, threads=threads)
     matrix = operator_selection.make_matrix(settings, run_folder(config, folder))
     train_matrix(matrix, workers, settings.retries)
-    compare(matrix, operator_selection.table, "Normalized returns at the last checkpoint (paper, table 2)")
+    compare(matrix, operator_selection.table, "Normalized returns at the last checkpoint (paper, table 2)", json)
     exit_if_failed(matrix)
 
 
@@ -125,6 +125,7 @@ def cross_validate(
     workers: Workers = 1,
     threads: Threads = None,
     folder: Folder = None,
+    json: Json = False,
 ) -> None:
     """Train the best candidates of a search on several environments, and write the winner as YAML."""
     from search.execution.storage import load_study, open_storage
@@ -135,10 +136,11 @@ def cross_validate(
     searched = load_study(open_storage(path, storage, create=False), settings.name)
     matrix = cross_validation.make_matrix(settings, searched, path, top)
     train_matrix(matrix, workers, settings.retries)
-    table = compare(matrix, cross_validation.ranking, "Cross-validation, AULC")
+    table = compare(matrix, cross_validation.ranking, "Cross-validation, AULC", json)
     if table is not None:
         winner = cross_validation.write_winner(table, path / "winner.yml")
-        say(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}")
+        if not json:
+            say(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}")
     exit_if_failed(matrix)
 
 
@@ -172,6 +174,7 @@ def benchmark(
         Path, typer.Option(help="Folder of the benchmark; more variants, tasks and seeds may be added to it.")
     ] = Path("runs/benchmark"),
     dry_run: DryRun = False,
+    json: Json = False,
 ) -> None:
     """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command resumes it."""
     from search.cli.results import show_benchmark
@@ -187,5 +190,5 @@ def benchmark(
         show_costs(unfinished(matrix), workers)
         return
     train_matrix(matrix, workers)
-    show_benchmark(folder)
+    show_benchmark(folder, json=json)
     exit_if_failed(matrix)

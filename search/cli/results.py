@@ -2,7 +2,6 @@
 
 import math
 from contextlib import suppress
-from json import loads
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -10,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from search.cli import options
-from search.cli.console import console, print_wide, say, say_json, show_table, time_to_go
+from search.cli.console import console, print_wide, records, say, say_json, show_table, time_to_go
 from search.cli.options import Storage, open_studies, search_folder
 
 if TYPE_CHECKING:
@@ -122,11 +121,6 @@ def patterns_by_name(others: list[str] | None) -> "dict[str, str | AuxLoss]":
     from search.results import analysis
 
     return {**analysis.PATTERNS, **{text: text for text in others or ()}}
-
-
-def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
-    """The rows of a table in plain values for JSON, names of rows included."""
-    return loads(frame.reset_index().to_json(orient="records", double_precision=15))
 
 
 @app.command()

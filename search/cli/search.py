@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.table import Table
 
-from search.cli.console import console, live, say, show_costs, time_to_go
+from search.cli.console import errors, live, say, show_costs, time_to_go
 from search.cli.options import DryRun, Folder, SearchFile, Storage, Threads, read_config, run_folder
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def show_progress(progresses: "Iterable[SearchProgress]") -> "SearchProgress | N
     shown = None
     with live() as show:
         for shown in progresses:
-            show(progress_table(shown) if console.is_terminal else progress_line(shown), shown.generations)
+            show(progress_table(shown) if errors.is_terminal else progress_line(shown), shown.generations)
     return shown
 
 

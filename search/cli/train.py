@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from search.cli.console import console, print_wide, say, say_json, time_to_go
+from search.cli.console import console, errors, print_wide, say, say_json, time_to_go
 from search.cli.options import SHIPPED, Json, Model, ModelConfig
 from search.training.shipped import find_file
 
@@ -38,6 +38,7 @@ def train(
     seed: Annotated[int, typer.Option(help="Seed of the run.", min=0)] = 0,
     threads: Annotated[int, typer.Option(help="Threads of PyTorch.", min=1)] = 1,
     folder: Annotated[Path | None, typer.Option(help="Folder for model and learning curve. Default: in runs/.")] = None,
+    json: Json = False,
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.callbacks import aulc
@@ -53,7 +54,7 @@ def train(
         now = time.monotonic()
         left, started = (evaluations - len(curve)) * (now - started), now
         point = curve[-1]
-        say(f"{point.environment_steps:,} environment steps: {point.mean:.1f} ± {point.std:.1f}, {time_to_go(left)}")
+        errors.print(f"{point.environment_steps:,} environment steps: {point.mean:.1f} ± {point.std:.1f}, {time_to_go(left)}")
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
@@ -62,6 +63,9 @@ def train(
     curve, path, was_finished = train_one(
         env, aux_loss, file, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation
     )
+    if json:
+        say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})
+        return
     table = Table("environment steps", "mean return", "deviation", "seconds", title=f"AULC {aulc(curve):.1f}")
     for column in table.columns:
         column.justify = "right"
