@@ -22,12 +22,14 @@ import importlib
 import runpy
 import sys
 from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import yaml
 
-from sb3_aarl.envs import env_ids, make_dmc_env  # first: it chooses the renderer
+from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env  # first: it chooses the renderer
 from sb3_aarl.sac_aux import SACAux
 
 # Functions in RL-Zoo's modules, each of its own name; the others are scripts. Two scripts are missing: record_training starts
@@ -72,7 +74,9 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     RL-Zoo passes those of the file to the training environment only; those of the command line are stored with the model
     and reach evaluations, ``enjoy`` and ``record_video`` too. Given ones win.
 
-    :param arguments: RL-Zoo's arguments; the program ends with an error where ``sac_aux`` has no readable file
+    Without a file ``sac_aux`` has AARL-State's for tasks of DeepMind Control, and RL-Zoo's own for SAC elsewhere.
+
+    :param arguments: RL-Zoo's arguments; the program ends with an error where the file cannot be read
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_aarl.rl_zoo train", add_help=False)
     parser.add_argument("--algo")
@@ -82,7 +86,10 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     known, _ = parser.parse_known_args(arguments)
     path = known.conf_file
     if path is None and known.algo == "sac_aux":
-        parser.error("RL-Zoo has no hyper-parameters for sac_aux: name a file with -conf, such as zoo_configs/aarl_state.yml")
+        ours = Path(__file__).parents[1] / "zoo_configs/aarl_state.yml"
+        theirs = files("rl_zoo3") / "hyperparams/sac.yml"
+        path = str(ours if str(known.env).startswith(PREFIX) else theirs)
+        arguments = [*arguments, "-conf", path]
     if path is None or not path.endswith((".yml", ".yaml")):
         return list(arguments)
     try:
@@ -107,9 +114,7 @@ def main() -> None:
     parser.add_argument("program", choices=PROGRAMS)
     program = parser.parse_args(sys.argv[1:2]).program
     arguments = sys.argv[2:]
-    if program == "train":
-        arguments = with_env_kwargs(arguments)
-    elif program == "record_video":
+    if program == "record_video":
         # RL-Zoo has this option for train and enjoy.
         packages = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         packages.add_argument("--gym-packages", nargs="+", default=[])
@@ -119,12 +124,14 @@ def main() -> None:
     elif program in ("plot_train", "all_plots"):
         # They look for folders, in whose names RL-Zoo has a dash for the slash.
         arguments = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
-    sys.argv = [f"{parser.prog} {program}", *arguments]
     try:
         register()
+        if program == "train":
+            arguments = with_env_kwargs(arguments)
         run = getattr(importlib.import_module(FUNCTIONS[program]), program) if program in FUNCTIONS else None
     except ModuleNotFoundError as error:
         parser.error(f"{error}: pip install 'sb3-aarl[zoo]'")
+    sys.argv = [f"{parser.prog} {program}", *arguments]
     if run is None:
         runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
     else:

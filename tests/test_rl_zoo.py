@@ -202,6 +202,11 @@ def test_one_error_for_a_file_that_is_missing_or_none(tmp_path: Path, capsys: py
         with pytest.raises(SystemExit):
             with_env_kwargs([*SAC_AUX, "-conf", str(tmp_path / name)])
         assert f"error: {tmp_path / name} is no file of hyper-parameters" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        with_env_kwargs(SAC_AUX)
-    assert "zoo_configs/aarl_state.yml" in capsys.readouterr().err
+
+
+def test_a_file_is_not_needed() -> None:
+    pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
+    arguments = with_env_kwargs(SAC_AUX)
+    assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "aarl_state.yml" and added(arguments) == {"action_repeat": 4}
+    *_, theirs = with_env_kwargs(["--algo", "sac_aux", "--env", "Pendulum-v1"])
+    assert theirs.endswith("rl_zoo3/hyperparams/sac.yml")
