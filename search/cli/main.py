@@ -12,7 +12,7 @@ from search.cli import figures, matrices, results, search, train
 from search.cli.console import errors
 
 # Training alone does without these modules; the extra that has them.
-EXTRAS = {"psycopg": "postgres", "ray": "ray"}
+EXTRAS = {"imageio": "dmc", "psycopg": "postgres", "ray": "ray"}
 OF_SEARCH = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "plotly", "scipy", "sklearn", "sqlalchemy", "tenacity")
 
 
