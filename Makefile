@@ -73,13 +73,13 @@ system:
 wheel:
 	set -e; folder=$$(mktemp -d); trap 'rm -rf $$folder' EXIT; \
 	$(PYTHON) -m venv $$folder/venv; \
-	export PATH=$$folder/venv/bin:$$PATH; \
+	export OMP_NUM_THREADS=1 PATH=$$folder/venv/bin:$$PATH; \
 	pip wheel --quiet --no-deps --wheel-dir $$folder .; \
-	pip install --quiet $$(grep ^torch== constraints.txt) $$folder/*.whl; \
+	pip install --quiet --no-compile $$(grep ^torch== constraints.txt) $$folder/*.whl; \
 	cd $$folder; \
 	python -c 'from sb3_aarl import SACAux; SACAux("MlpPolicy", "Pendulum-v1", aux_loss="aarl-state").learn(150)'; \
 	aarl losses; \
-	aarl train Pendulum-v1 --steps 600 --evaluations 2 --episodes 1
+	aarl train Pendulum-v1 --steps 1200 --evaluations 1 --episodes 1
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
