@@ -1,4 +1,4 @@
-"""Draw README's picture, docs/images/curves.png, from the runs that lie beside it: SACAux and SB3's SAC with the same sizes."""
+"""Draw docs/images/curves.png, README's picture, from the runs that lie beside it: SACAux and SAC with the same sizes."""
 
 from pathlib import Path
 
