@@ -133,7 +133,9 @@ def sac_and_ours(policy: str, env: Callable[[], Any], steps: int, ours: dict[str
     both |= {"seed": 5, "device": "cpu", **settings}
     sac = SAC(policy, env(), **both).learn(steps)
     ours = {**both, **ours, "policy_kwargs": {**both["policy_kwargs"], **ours["policy_kwargs"]}}
-    return sac, SACAux(policy, env(), **{"policy_delay": 1, "aux_loss": None, **ours}).learn(steps)
+    as_in_sb3: dict[str, Any] = {"policy_delay": 1, "ent_coef_learning_rate": None, "ent_coef_betas": (0.9, 0.999)}
+    as_in_sb3 |= {"ent_coef": "auto", "aux_loss": None}
+    return sac, SACAux(policy, env(), **{**as_in_sb3, **ours}).learn(steps)
 
 
 @pytest.mark.parametrize(
@@ -369,7 +371,6 @@ def test_train_agrees_with_naive_steps(
         gamma=0.9,
         tau=0.1,
         target_update_interval=2,
-        ent_coef_betas=(0.5, 0.999),
         encoder_tau=0.3,
         joint_optimizer=joint,
         predictor_batch_norm=batch_norm,
