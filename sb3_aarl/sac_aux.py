@@ -68,7 +68,7 @@ class SACAux(SAC):
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns, not for Dict observations (as in SB3)
     :param ent_coef: Entropy coefficient; ``"auto_0.1"`` (the paper) learns it from 0.1 on. From 1 on (``"auto"``, SB3) it
-        takes long to fall: AARL-State on Cheetah-Run, 100K environment steps, seeds 0 and 1: FIGURES
+        takes long to fall
     :param target_update_interval: Gradient steps between updates of the target critic
     :param target_entropy: As in SB3
     :param use_sde: Whether to use gSDE, as in SB3

@@ -185,7 +185,7 @@ def test_another_seed_is_another_run(tmp_path: Path) -> None:
     """Else the tests above would be content with a constant."""
     curves = []
     for seed in (1, 2):
-        prepare_run(tmp_path / str(seed), make_run("normalize", seed=seed, checkpoints=(60, 120)))
+        prepare_run(tmp_path / str(seed), make_run("simba", seed=seed, checkpoints=(60, 120)))
         curves.append([point.mean for point in train(tmp_path / str(seed))])
     assert len({*curves[0], *curves[1]}) == 4
 
