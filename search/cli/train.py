@@ -38,13 +38,14 @@ def train(
     seed: Annotated[int, typer.Option(help="Seed of the run.", min=0)] = 0,
     threads: Annotated[int, typer.Option(help="Threads of PyTorch.", min=1)] = 1,
     folder: Annotated[Path | None, typer.Option(help="Folder for model and learning curve. Default: in runs/.")] = None,
+    imports: Annotated[str, typer.Option(help="Modules of yours that register environments, such as my_env,other.")] = "",
     json: Json = False,
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.callbacks import aulc
     from sb3_aarl.envs import PREFIX
     from search.studies.single import train_one
-    from search.training.config import resolve_env_id
+    from search.training.config import import_modules, resolve_env_id
 
     started = time.monotonic()
 
@@ -58,10 +59,11 @@ def train(
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
+    modules = import_modules(imports.split(",") if imports else ())
     env = resolve_env_id(env)
     file = find_file(config or Path("aarl_state" if env.startswith(PREFIX) else "default"))
     curve, path, was_finished = train_one(
-        env, aux_loss, file, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation
+        env, aux_loss, file, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation, modules
     )
     if json:
         say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from stable_baselines3.common.env_util import make_vec_env
@@ -49,6 +49,7 @@ def train_one(
     folder: str | Path | None = None,
     progress_bar: bool = True,
     on_evaluation: Callable[[list[Evaluation]], bool | None] | None = None,
+    imports: Sequence[str] = (),
 ) -> tuple[list[Evaluation], Path, bool]:
     """
     Train with one loss in this process, and keep model, learning curve and ``provenance.json``.
@@ -60,6 +61,7 @@ def train_one(
     :param environment_steps: Environment steps of the run, None for the file's ``n_timesteps``
     :param folder: Folder of the run, None for one in ``runs`` named after environment, loss and settings
     :param on_evaluation: Called with the curve so far after each evaluation
+    :param imports: Modules that have been imported, and that a resumed run imports first
     :return: The learning curve, the folder, and whether the run was finished before
     :raises ValueError: when something is unknown or does not fit, or the folder has another run
     """
@@ -86,6 +88,7 @@ def train_one(
         evaluation_episodes=evaluation_episodes,
         threads=threads,
         keep_model=True,
+        imports=tuple(imports),
     )
     if folder is None:
         # A notation may be longer than the name of a file may be.
