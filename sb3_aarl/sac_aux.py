@@ -405,18 +405,14 @@ class SACAux(SAC):
 
                 # Actor: neither the encoder nor the critic gets a gradient from it.
                 if update_actor:
-                    frozen = [parameter for parameter in self.critic.q_parameters() if parameter.requires_grad]
-                    for parameter in frozen:
-                        parameter.requires_grad_(False)
                     with autocast:
                         actor_loss = self._actor_loss(batch.observations, actions_pi, log_prob, ent_coef)
                     log("actor_loss", actor_loss)
-                    if actor_loss.requires_grad:
+                    trained = [parameter for parameter in self.actor.own_parameters() if parameter.requires_grad]
+                    if trained:
                         self.actor.optimizer.zero_grad()
-                        actor_loss.backward()
+                        actor_loss.backward(inputs=trained)
                         self.actor.optimizer.step()
-                    for parameter in frozen:
-                        parameter.requires_grad_(True)
 
                 if self._n_updates % self.target_update_interval == 0:
                     self._update_target()
