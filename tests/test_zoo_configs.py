@@ -18,7 +18,7 @@ from sb3_aarl.envs import env_ids, make_dmc_env
 from search.training.config import load_hyperparameters, merge
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
-FILES = sorted(path for folder in (ZOO, ZOO / "choices", ZOO / "body") for path in folder.glob("*.yml"))
+FILES = sorted(path for folder in (ZOO, ZOO / "choices", ZOO / "body", ZOO / "defaults") for path in folder.glob("*.yml"))
 
 # Table 4: 100K steps above, 1000K below.
 EASY = (
