@@ -105,6 +105,8 @@ class SACAux(SAC):
     :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16; parameters, optimizers, Q
         targets, entropy, losses and predictions stay float32. Faster where the device has instructions for it, many times
         slower elsewhere (x86 processors without AVX-512; logs a warning)
+    :param compile: Whether ``torch.compile`` compiles the losses, for a minute of the first gradient steps. It pays for wide
+        networks and long runs; without a C++ compiler logs a warning and goes on as it was
     :raises ValueError: for arguments that do not fit, with the culprit's name
 
     Training stops with :class:`NonFiniteError` where something is NaN or infinite, and with
