@@ -34,20 +34,8 @@ class Waves(BaseFeaturesExtractor):
 def main(steps: int) -> None:
     loss = AuxLoss.parse("{s_t, a_t, a_t+1} -> {s_t+1, r_t+1, s_t+2}")
     print(f"{loss}: horizon {loss.horizon}, operator {loss.operator}")
-    model = SACAux(
-        "MlpPolicy",
-        "Pendulum-v1",
-        aux_loss=loss,
-        batch_size=256,
-        learning_starts=100,
-        policy_kwargs={
-            "net_arch": [256, 256],
-            "features_extractor_class": Waves,
-            "features_extractor_kwargs": {"n_waves": 48},
-        },
-        verbose=1,
-        seed=0,
-    )
+    policy_kwargs = {"features_extractor_class": Waves, "features_extractor_kwargs": {"n_waves": 48}}
+    model = SACAux("MlpPolicy", "Pendulum-v1", aux_loss=loss, policy_kwargs=policy_kwargs, verbose=1, seed=0)
     model.learn(steps, log_interval=20)
     print(f"mean return: {evaluate_policy(model, model.get_env(), 10)[0]:.0f}")
 
