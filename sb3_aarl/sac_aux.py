@@ -47,9 +47,9 @@ class SACAux(SAC):
     Soft Actor-Critic with an auxiliary loss on its encoder (AARL), around SB3's SAC.
 
     The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The
-    encoder of the target critic is the momentum encoder of the auxiliary loss. Arguments of SB3's SAC have its defaults
-    but for ``ent_coef``, those of SACAux alone the paper's (tables 7 and 8) unless another source is named.
-    ``zoo_configs/`` has all of the paper's values.
+    encoder of the target critic is the momentum encoder of the auxiliary loss. Arguments of SB3's SAC have its defaults,
+    those of SACAux alone the paper's (tables 7 and 8) unless another source is named; all of the paper's values are in
+    ``zoo_configs/``. The entropy coefficient learns as SAC's, see ``results/``: with the paper's rate it falls too slowly from 1.
 
     :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
@@ -67,8 +67,7 @@ class SACAux(SAC):
         must be given for a class of your own
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns, not for Dict observations (as in SB3)
-    :param ent_coef: Entropy coefficient; ``"auto_0.1"`` (the paper) learns it from 0.1 on. From 1 on (``"auto"``, SB3) it
-        takes long to fall
+    :param ent_coef: As in SB3; ``"auto_0.1"`` (the paper) learns it from 0.1 on
     :param target_update_interval: Gradient steps between updates of the target critic
     :param target_entropy: As in SB3
     :param use_sde: Whether to use gSDE, as in SB3
@@ -96,8 +95,8 @@ class SACAux(SAC):
     :param predictor_width: Hidden units of the predictor (256), None for twice its input (the reference)
     :param predictor_batch_norm: Whether the predictor has batch norm (the paper names none, the reference has it)
     :param policy_delay: Gradient steps between updates of actor and entropy coefficient (2: CURL, the reference)
-    :param ent_coef_learning_rate: Of the entropy coefficient, may be a schedule; None for ``learning_rate`` (SB3)
-    :param ent_coef_betas: Adam's betas for the entropy coefficient (SB3: (0.9, 0.999))
+    :param ent_coef_learning_rate: Of the entropy coefficient, may be a schedule; None for ``learning_rate`` (SB3; table 8: 1e-4)
+    :param ent_coef_betas: Adam's betas for the entropy coefficient (SB3; table 8: (0.5, 0.999))
     :param augmentation: ``"random_crop"`` to ``crop_size`` in training with a centre crop elsewhere,
         ``"random_shift"`` by up to 4 pixels, ``"none"``; ``"auto"`` crops if all images are larger than ``crop_size``
         and shifts if not. Vectors are never augmented
@@ -140,7 +139,7 @@ class SACAux(SAC):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        ent_coef: str | float = "auto_0.1",
+        ent_coef: str | float = "auto",
         target_update_interval: int = 1,
         target_entropy: str | float = "auto",
         use_sde: bool = False,
@@ -161,8 +160,8 @@ class SACAux(SAC):
         predictor_width: int | None = 256,
         predictor_batch_norm: bool = False,
         policy_delay: int = 2,
-        ent_coef_learning_rate: float | Schedule | None = 1e-4,
-        ent_coef_betas: tuple[float, float] = (0.5, 0.999),
+        ent_coef_learning_rate: float | Schedule | None = None,
+        ent_coef_betas: tuple[float, float] = (0.9, 0.999),
         augmentation: str = "auto",
         crop_size: int | None = None,
         precision: str = "fp32",
