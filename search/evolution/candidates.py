@@ -47,9 +47,6 @@ class Candidates:
     They are planned in rounds. Round g starts when generation g - 1 is over. It has the slots of generation g that need
     parents (in the first one all), and then the random ones of generation g + 1. It knows nothing of its own results, so
     that the plan does not depend on the order in which trials finish.
-
-    :param sampler: The settings
-    :param seed: Seed of the study
     """
 
     def __init__(self, sampler: "AuxLossSampler", seed: int):

@@ -49,13 +49,7 @@ class SearchProgress(NamedTuple):
 
 @dataclass
 class RunningTrial:
-    """
-    A trial whose runs are at the executor.
-
-    :param trial: The trial
-    :param submissions: One run for each seed
-    :param n_reported: Evaluations that were reported to Optuna
-    """
+    """A trial whose runs, one for each seed, are at the executor, and how many evaluations were reported to Optuna."""
 
     trial: optuna.Trial
     submissions: list[Submission]
@@ -256,12 +250,7 @@ def search_progress(study: optuna.Study, sampler: AuxLossSampler) -> SearchProgr
 
 
 def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:
-    """
-    Where a candidate's runs are: named after generation, slot and attempt, so that the next trial of a slot finds them.
-
-    :param folder: Folder of the search
-    :param trial: The trial
-    """
+    """A candidate's folder, named after generation, slot and attempt, so that the next trial of a slot finds its runs."""
     at = trial.user_attrs
     if "slot" not in at:  # of a study.optimize of the user's own with more processes than slots
         return folder / "candidates" / f"trial-{trial.number}"
@@ -269,9 +258,5 @@ def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:
 
 
 def score(curves: Sequence[Sequence[Evaluation]]) -> float:
-    """
-    The score of a candidate: its mean area under the learning curve over the seeds.
-
-    :param curves: One for each seed
-    """
+    """The score of a candidate: its mean area under the learning curve over the seeds."""
     return float(np.mean([aulc(curve) for curve in curves]))

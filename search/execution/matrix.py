@@ -22,13 +22,7 @@ POLL_SECONDS = 0.5
 
 
 class Cell(NamedTuple):
-    """
-    One run of a matrix.
-
-    :param variant: Name of what is trained
-    :param environment: Id of the environment
-    :param seed: Seed of the run
-    """
+    """One run of a matrix: the name of what is trained, the id of its environment, and its seed."""
 
     variant: str
     environment: str
@@ -38,12 +32,8 @@ class Cell(NamedTuple):
 @dataclass(frozen=True)
 class Matrix:
     """
-    Runs by variant, environment and seed.
-
-    :param name: What a progress bar calls it
-    :param folder: Its folder
-    :param runs: The runs, in the order in which they are started
-    :param abouts: What ``provenance.json`` says of a run beside its own values
+    Runs by variant, environment and seed, in the order in which they are started; ``abouts`` is what ``provenance.json`` says
+    of a run beside its own values.
     """
 
     name: str
@@ -53,12 +43,7 @@ class Matrix:
 
 
 class MatrixProgress(NamedTuple):
-    """
-    :param total: Number of runs
-    :param finished: Those that are finished
-    :param failed: Those that were given up
-    :param seconds_to_go: Estimated seconds until all are over, None while that is not known
-    """
+    """How many runs there are, are finished, were given up; estimated seconds until all are over, None while not known."""
 
     total: int
     finished: int
@@ -78,21 +63,12 @@ def all_cells(variants: Iterable[str], environments: Iterable[str], seeds: Itera
 
 
 def task_name(environment: str) -> str:
-    """
-    The short form of a DeepMind Control task's id; other ids as they are.
-
-    :param environment: Id of the environment
-    """
+    """The short form of a DeepMind Control task's id; other ids as they are."""
     return environment.removeprefix(PREFIX).removesuffix("-v0") if environment.startswith(PREFIX) else environment
 
 
 def cell_folder(folder: Path, cell: Cell) -> Path:
-    """
-    Where a run is: ``FOLDER/VARIANT/TASK/seed-N``.
-
-    :param folder: Folder of the matrix
-    :param cell: The run
-    """
+    """Where a run is: ``FOLDER/VARIANT/TASK/seed-N``."""
     variant = cell.variant
     if not re.fullmatch(r"[\w.-]{1,80}", variant):  # such as a loss's notation
         slug = re.sub(r"[^a-z0-9]+", "-", variant.lower()).strip("-")[:60]
@@ -145,18 +121,12 @@ def scores(matrix: Matrix) -> pd.DataFrame:
     """
     The finished runs: one row each with ``variant``, ``environment``, ``seed``, ``score`` (AULC) and ``last`` (mean return at
     the last checkpoint).
-
-    :param matrix: The runs
     """
     return _scores((cell, cell_folder(matrix.folder, cell)) for cell in matrix.runs)
 
 
 def stored_scores(folder: Path) -> pd.DataFrame:
-    """
-    The same of all runs in the folder of a matrix, read without its configuration; none if the folder is not there.
-
-    :param folder: Folder of the matrix
-    """
+    """The same of all runs in the folder of a matrix, read without its configuration; none if the folder is not there."""
     abouts = {file.parent: read_about(file.parent) for file in sorted(folder.glob(f"*/*/*/{ABOUT}"))}
     return _scores((Cell(*(about[name] for name in Cell._fields)), path) for path, about in abouts.items())
 
@@ -185,8 +155,6 @@ def comparable(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The runs of the variants that have each environment and seed which any variant has. The others cannot be ranked: what
     they lack may be what is hard.
-
-    :param runs: As returned by :func:`scores`
     """
     n_pairs = len(runs[["environment", "seed"]].drop_duplicates())
     return runs[runs.groupby("variant")["variant"].transform("size") == n_pairs]

@@ -124,8 +124,6 @@ def table5_classes(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = 
     Section 3.3 compares losses with n_target > n_source to "the other way around", which it writes n_target < n_source. So
     a loss with n_target = n_source is in neither class.
 
-    :param table: As returned by :func:`trial_table`
-    :param patterns: Name and pattern of each column: an AuxLoss, its notation, or its name in the catalogue
     :return: One row an analysed trial, one column a pattern, then ``COUNTS``
     :raises ValueError: for a pattern that cannot be read
     """
@@ -148,8 +146,6 @@ def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS
     each other, and later generations score higher and have other patterns. So p-values are lower than those of an
     experiment, and they are not corrected for the number of tests.
 
-    :param table: As returned by :func:`trial_table`
-    :param patterns: As in :func:`table5_classes`
     :return: One row a pattern, then ``COUNTS``: ``difference`` of the mean scores (with - without), ``welch_p`` of Welch's
         two-sided t-test (NaN where a class is too small), ``mean_with``, ``mean_without``, ``n_with``, ``n_without``,
         ``n_neither``
@@ -181,8 +177,6 @@ def table5_layout(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """
     Table 5 as the paper prints it: one row a study, differences with * where Welch's p < 0.05 and ** where p < 0.01 (the
     paper only says "t-test"), a dash where a class is empty.
-
-    :param tables: Results of :func:`table5` by the names of the studies
     """
 
     def cell(row: pd.Series) -> str:
@@ -262,7 +256,6 @@ def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = St
     """
     The best trial and all its ancestors, the latest first; empty if no trial has a score.
 
-    :param trials: All trials of the study, in the order of numbers
     :return: By ``number``: ``generation``, ``operation``, ``parents``, ``score``, ``gain`` (the score less that of the best
         parent, NaN without parents) and the notation of the ``loss``
     """
@@ -311,14 +304,7 @@ def summary(
     patterns: Mapping[str, str | AuxLoss] = PATTERNS,
     top: int = 10,
 ) -> Summary:
-    """
-    Everything above for one study; ``operator`` only if it was searched, the losses of ``lineage`` as their notation.
-
-    :param trials: All trials of the study, in the order of numbers
-    :param direction: The study's
-    :param patterns: As in :func:`table5_classes`
-    :param top: As in :func:`rank_agreement`
-    """
+    """Everything above for one study; ``operator`` only if it was searched, the losses of ``lineage`` as their notation."""
     table = trial_table(trials)
     operator = ["operator", "negatives"]
     tables = {

@@ -42,13 +42,7 @@ def evolution_figure(
     baselines: Iterable[tuple[str, float]] = (),
     direction: StudyDirection = StudyDirection.MAXIMIZE,
 ) -> go.Figure:
-    """
-    The score of every completed candidate by generation (the paper's figures 4 and 6), with mean and best of the generations.
-
-    :param table: Trials of a study, as returned by ``analysis.trial_table``; those without a score are skipped
-    :param baselines: Names and scores of horizontal lines
-    :param direction: The study's, for what is best
-    """
+    """The score of every completed candidate by generation (the paper's figures 4 and 6), with their mean and best."""
     scored = table[table["score"].notna()]
     notations = ["<br>".join(textwrap.wrap(escape(str(loss)), 80)) if loss else "no loss" for loss in scored["loss"]]
     # Plain lists, not arrays: plotly.py writes arrays in a form that the dashboard's older plotly.js cannot read.
@@ -118,13 +112,7 @@ def evolution_plot(
     baselines: Mapping[str, Iterable[tuple[str, float]]] | None = None,
     direction: StudyDirection = StudyDirection.MAXIMIZE,
 ) -> Figure:
-    """
-    The score of every candidate by generation, beside baselines: the paper's figures 4 and 6, one panel a study.
-
-    :param tables: Title and trials of each study, as returned by ``analysis.trial_table``
-    :param baselines: Names and scores of each study's baselines, under the study's title
-    :param direction: The studies', for what is best
-    """
+    """The score of every candidate by generation, beside baselines: the paper's figures 4 and 6, one panel a study."""
     baselines = {title: list(lines) for title, lines in (baselines or {}).items()}
     names = list(dict.fromkeys(name for lines in baselines.values() for name, _ in lines))
     figure, panels = _panels(list(tables), columns=3, width=4.4, height=3.6)
@@ -150,8 +138,6 @@ def histogram_plot(tables: Mapping[str, pd.DataFrame]) -> Figure:
     """
     How the scores of up to three studies are distributed: the paper's figure 7, evolution with and without pruning of the
     search space.
-
-    :param tables: Name and trials of each study, as returned by ``analysis.trial_table``
     """
     if len(tables) > len(HISTOGRAMS):
         raise ValueError(f"a histogram shows at most {len(HISTOGRAMS)} studies, not {len(tables)}: {', '.join(tables)}")
@@ -171,9 +157,6 @@ def patterns_plot(
     """
     Scores of the candidates with and without each pattern of table 5: the paper's figure 11. One column of panels a study;
     a single study's patterns stand beside each other. Each class is a population of its own: its bars sum to 100 %.
-
-    :param tables: Title and trials of each study, as returned by ``analysis.trial_table``
-    :param patterns: As in ``analysis.table5``
     """
     names = [*patterns, *analysis.COUNTS]
     single = len(tables) == 1
@@ -199,13 +182,7 @@ def patterns_plot(
 
 
 def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
-    """
-    Learning curves of the best candidates under three metrics (AULC, first and last checkpoint): the paper's figure 10.
-
-    :param table: Trials of a study, as returned by ``analysis.trial_table``
-    :param top: Number of candidates in each panel
-    :raises ValueError: as :func:`rankings` does
-    """
+    """Learning curves of the best candidates under three metrics (AULC, first and last checkpoint): the paper's figure 10."""
     ranking = rankings(analysis.analysed(table))
     agreement = rank_agreement(ranking, top)
     steps = [point[0] for point in ranking["curve"].iloc[0]]
@@ -242,7 +219,6 @@ def learning_curves_plot(curves: pd.DataFrame, smooth: int = 1) -> Figure:
     A point is drawn where all seeds of its variant and task have one. The shade is the standard deviation over the seeds;
     where there is one seed only, over its episodes.
 
-    :param curves: As returned by ``search.studies.benchmark.read_curves``
     :param smooth: Evaluations over which each run is averaged, centred; the paper smooths too and does not say how much
     """
     tasks, variants = list(curves["env"].unique()), list(curves["variant"].unique())

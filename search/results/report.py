@@ -60,15 +60,7 @@ def write_report(
     validation: pd.DataFrame | None = None,
     benchmark: Path | None = None,
 ) -> None:
-    """
-    Write the report of a study, finished or not.
-
-    :param study: The study
-    :param path: Where the HTML file goes; its folder is made if it is not there
-    :param baselines: Names and scores to compare with
-    :param validation: Runs of the cross-validation, as returned by :func:`search.execution.matrix.stored_scores`
-    :param benchmark: Folder of a benchmark whose tables and learning curves are shown too
-    """
+    """Write the report of a study, finished or not, with baselines and the runs of its cross-validation as one HTML file."""
     trials = study.get_trials(deepcopy=False)
     table = analysis.trial_table(trials)
     best = ranked(trials, study.direction)

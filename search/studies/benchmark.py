@@ -34,15 +34,10 @@ def load_benchmark(
     """
     Read the variants of a benchmark, and check all that can be checked without training.
 
-    :param files: Files of hyper-parameters, as ``load_hyperparameters`` reads them; the variants have their names
     :param environments: Ids or short forms; none for those that all files name
-    :param seeds: Seeds of the runs on each
     :param checkpoints: Environment steps of the comparison; none for those of 100k, 500k and 1000k that lie in
         every file's ``n_timesteps``
     :param every: Environment steps after which runs are also evaluated
-    :param evaluation_episodes: Episodes of each evaluation
-    :param threads: Threads of each run
-    :param folder: Folder of the benchmark, which may have runs of other variants, tasks and seeds
     :raises ValueError: naming what is wrong, or which setting differs from that of runs in the folder
     """
     for stem, count in Counter(path.stem for path in files).items():
@@ -129,11 +124,7 @@ def read_curves(folder: Path) -> pd.DataFrame:
 
 
 def parse_steps(text: str) -> tuple[int, ...]:
-    """
-    Environment steps, such as ``100k,500k,1M`` or ``20000``.
-
-    :raises ValueError: naming what is no number of steps
-    """
+    """Environment steps, such as ``100k,500k,1M`` or ``20000``."""
     steps = []
     for part in text.split(","):
         match = re.fullmatch(r"([1-9]\d*)([km]?)", part.strip().lower())
@@ -144,11 +135,7 @@ def parse_steps(text: str) -> tuple[int, ...]:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """
-    Seeds, such as ``0-9`` or ``0,3,5-7``.
-
-    :raises ValueError: naming what is neither a number nor a range
-    """
+    """Seeds, such as ``0-9`` or ``0,3,5-7``."""
     seeds: list[int] = []
     for part in text.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())

@@ -54,13 +54,9 @@ def train_one(
     """
     Train with one loss in this process, and keep model, learning curve and ``provenance.json``.
 
-    :param environment: Id of the environment, or the short form of a DeepMind Control task
     :param aux_loss: Notation, name, or YAML file of ``load_aux_loss``; ``"none"`` for none; None for what the file of
         hyper-parameters says, or ``"auto"``
-    :param config: File of hyper-parameters
     :param environment_steps: Environment steps of the run, None for the file's ``n_timesteps``
-    :param folder: Folder of the run, None for one in ``runs`` named after environment, loss and settings
-    :param on_evaluation: Called with the curve so far after each evaluation
     :param imports: Modules that have been imported, and that a resumed run imports first
     :return: The learning curve, the folder, and whether the run was finished before
     :raises ValueError: when something is unknown or does not fit, or the folder has another run
@@ -107,10 +103,6 @@ def load_trained(
     """
     A trained model, and an environment for it: that of the run that it is from, or another one.
 
-    :param path: Folder of a run with its model, or the file of a model
-    :param environment: Id or short form; None for that of the run
-    :param config: File of hyper-parameters whose ``env_kwargs`` count; None for those of the run, if there is one
-    :param renders: Whether the environment renders
     :raises ValueError: when there is no model, or the environment is not known
     """
     folder = path if path.is_dir() else path.parent

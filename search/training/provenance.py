@@ -64,11 +64,7 @@ def versions() -> str:
 
 
 def hide_password(text: str) -> str:
-    """
-    A text that may hold the URL of a database, without its password.
-
-    :param text: Such as an error message
-    """
+    """A text that may hold the URL of a database, without its password."""
     return re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", text)
 
 
