@@ -65,6 +65,7 @@ class RunningTrial:
             submission.stop()
 
 
+@dataclass(eq=False)
 class Driver:
     """
     One search: iterate over it to run it. Leaving the loop marks the trials that run as interrupted.
@@ -79,28 +80,19 @@ class Driver:
     :param on_change: Called with a trial when it starts, when it is reported, and before it is told
     """
 
-    def __init__(
-        self,
-        study: optuna.Study,
-        storage: BaseStorage,
-        make_runs: Callable[[AuxLoss], Sequence[Run]],
-        executor: Executor,
-        folder: Path,
-        workers: int = 1,
-        retries: int = 3,
-        on_change: Callable[[optuna.Trial], None] = lambda trial: None,
-    ):
-        if not isinstance(study.sampler, AuxLossSampler):
-            raise TypeError(f"a search needs an AuxLossSampler, not {type(study.sampler).__name__}")
-        self.study = study
-        self.storage = storage
-        self.sampler = study.sampler
-        self.make_runs = make_runs
-        self.executor = executor
-        self.folder = folder
-        self.workers = workers
-        self.retries = retries
-        self.on_change = on_change
+    study: optuna.Study
+    storage: BaseStorage
+    make_runs: Callable[[AuxLoss], Sequence[Run]]
+    executor: Executor
+    folder: Path
+    workers: int = 1
+    retries: int = 3
+    on_change: Callable[[optuna.Trial], None] = lambda trial: None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.study.sampler, AuxLossSampler):
+            raise TypeError(f"a search needs an AuxLossSampler, not {type(self.study.sampler).__name__}")
+        self.sampler = self.study.sampler
         self.running: dict[int, RunningTrial] = {}
         self.n_failures = 0
         # A database that is away for a while fails any of the calls; all may be repeated.
