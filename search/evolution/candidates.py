@@ -131,7 +131,7 @@ class Candidates:
         """One offspring, redrawn while it is invalid or known."""
         candidate = None
         for _ in range(MAX_DRAWS):
-            with contextlib.suppress(mutations.RejectedLoss):
+            with contextlib.suppress(ValueError):
                 candidate = self._offspring(rng, operation, slot)
                 if self.sampler.allow_duplicates or not is_known(candidate.loss.canonical()):
                     return candidate
@@ -159,6 +159,6 @@ class Candidates:
             return Candidate(mutations.horizon_change(parent.loss, rng, max_horizon), operation, (parent.number,))
         partners = [other for other in self.parents if other is not parent and other.loss.horizon == parent.loss.horizon]
         if not partners:
-            raise mutations.RejectedLoss(f"no other parent has horizon {parent.loss.horizon}")
+            raise ValueError(f"no other parent has horizon {parent.loss.horizon}")
         other = partners[rng.integers(len(partners))]
         return Candidate(mutations.crossover(parent.loss, other.loss, rng), operation, (parent.number, other.number))
