@@ -28,22 +28,9 @@ PATTERNS: Mapping[str, str | AuxLoss] = {
 }
 # The other columns of table 5, one for each kind of token: n_target - n_source.
 COUNTS = tuple(f"{name}, n_target > n_source" for name in ("State", "Action", "Reward"))
-# Formats of the columns of a summary's tables, and their headings where these are not their names; numbers that are not here
-# are integers.
-FORMATS = {
-    **dict.fromkeys(("difference", "gain"), "+.2f"),
-    **dict.fromkeys(("score", "mean", "std", "median", "mean_with", "mean_without", "spearman", "kendall"), ".2f"),
-    **dict.fromkeys(("hours", "core_hours"), ".2f"),
-    **{
-        "welch_p": ".2g",
-        "importance": ".3f",
-        "distinct": ".0%",
-        "hamming": ".1f",
-        "average": ".2f",
-        "lowest": ".2f",
-        "highest": ".2f",
-    },
-}
+# Formats of the columns of a summary's tables where these are not integers or .2f, and their headings where these are not
+# their names.
+FORMATS = {"difference": "+.2f", "gain": "+.2f", "welch_p": ".2g", "importance": ".3f", "distinct": ".0%", "hamming": ".1f"}
 HEADINGS = {
     **{"n": "Losses", "std": "Deviation", "hamming": "Hamming distance", "index": "", "number": "Trial"},
     **{"device": "Trained on", "average": "Mean", "welch_p": "Welch p"},
@@ -340,7 +327,7 @@ def readable(name: str, table: pd.DataFrame) -> pd.DataFrame:
             return "–"
         if isinstance(value, bool):
             return "yes" if value else "no"
-        return format(value, FORMATS.get(column, "" if isinstance(value, str) else "d"))
+        return format(value, FORMATS.get(column, ".2f" if isinstance(value, float) else ""))
 
     flat = table.reset_index()
     text = pd.DataFrame({column: [cell(column, value) for value in flat[column].tolist()] for column in flat}, dtype=object)
