@@ -6,7 +6,6 @@ import re
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,17 +48,6 @@ class MatrixProgress(NamedTuple):
     finished: int
     failed: int
     seconds_to_go: float | None
-
-
-def all_cells(variants: Iterable[str], environments: Iterable[str], seeds: Iterable[int]) -> list[Cell]:
-    """
-    All runs of a comparison, seed by seed, so that a first one of each is there early.
-
-    :param variants: Names of what is trained
-    :param environments: Ids of the environments
-    :param seeds: Seeds of the runs on each
-    """
-    return [Cell(variant, environment, seed) for seed, environment, variant in product(seeds, environments, variants)]
 
 
 def task_name(environment: str) -> str:

@@ -4,6 +4,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pandas as pd
 
 from sb3_aarl import catalog
 from sb3_aarl.envs import PREFIX
-from search.execution.matrix import Cell, Matrix, all_cells, task_name
+from search.execution.matrix import Cell, Matrix, task_name
 from search.training.config import ConfigError, action_repeat, load_hyperparameters, read_yaml, resolve_env_id
 from search.training.provenance import ABOUT, read_about
 from search.training.run import FREE, Run, check_run, checkpoint_interval, differences, partial_curve
@@ -53,7 +54,9 @@ def load_benchmark(
     paths = {path.stem: str(path) for path in files}
     runs: dict[Cell, Run] = {}
     abouts: dict[Cell, dict[str, Any]] = {}
-    for cell in all_cells(paths, ids, seeds):
+    # Seed by seed, so that a first run of each is there early.
+    for seed, environment, variant in product(seeds, ids, paths):
+        cell = Cell(variant, environment, seed)
         settings, steps = hyperparameters[cell[:2]], compared[cell.environment]
         evaluations = _evaluations(steps, every, checkpoint_interval(settings), cell)
         loss = settings["aux_loss"]
