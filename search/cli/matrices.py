@@ -46,21 +46,15 @@ def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
 def compare(
     matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str, json: bool
 ) -> "pd.DataFrame | None":
-    """Show a table of the variants that can be compared, and return it; show the scores of the others beside it."""
+    """Show a table of the variants that can be compared, and return it."""
     from search.execution.matrix import comparable, scores
-    from search.studies.cross_validation import ranking
 
-    runs = scores(matrix)
-    compared = comparable(runs)
-    others = runs.drop(compared.index)
+    compared = comparable(scores(matrix))
     ranked = None if compared.empty else table(compared)
     if json:
-        say_json({"ranked": [] if ranked is None else records(ranked), "others": records(ranking(others))})
-        return ranked
-    if ranked is not None:
+        say_json([] if ranked is None else records(ranked))
+    elif ranked is not None:
         show_table(texts(ranked), title)
-    if not others.empty:
-        show_table(texts(ranking(others)), "Not ranked, because runs are missing: AULC of those that are finished")
     return ranked
 
 
