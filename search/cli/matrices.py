@@ -70,9 +70,11 @@ def texts(frame: "pd.DataFrame") -> "pd.DataFrame":
 
 def exit_if_failed(matrix: "Matrix") -> None:
     """Name the runs that failed, in one line each; exit code 1 if there are any."""
-    from search.execution.matrix import failures
+    from search.execution.matrix import cell_folder
+    from search.training.run import read_outcome
 
-    found = failures(matrix)
+    outcomes = {cell: read_outcome(cell_folder(matrix.folder, cell)) for cell in matrix.runs}
+    found = {cell: outcome.failure for cell, outcome in outcomes.items() if outcome and outcome.failure is not None}
     for cell, reason in found.items():
         line = f"Failed: {cell.variant} on {cell.environment}, seed {cell.seed}: {reason}"
         errors.print(line, style="red", markup=False, highlight=False)

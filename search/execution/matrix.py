@@ -15,7 +15,7 @@ from sb3_aarl.callbacks import aulc, replace_text
 from sb3_aarl.envs import PREFIX
 from search.execution.runs import Executor, Submission
 from search.training.provenance import ABOUT, read_about, write_about
-from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run, read_outcome
+from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run
 
 POLL_SECONDS = 0.5
 
@@ -123,20 +123,6 @@ def _scores(runs: Iterable[tuple[Cell, Path]]) -> pd.DataFrame:
     curves = [(cell, partial_curve(path)) for cell, path in runs if is_finished(path)]
     rows = [(*cell, aulc(curve), curve[-1].mean) for cell, curve in curves]
     return pd.DataFrame(rows, columns=[*Cell._fields, "score", "last"])
-
-
-def failures(matrix: Matrix) -> dict[Cell, str]:
-    """
-    The runs that failed, with the reasons.
-
-    :param matrix: The runs
-    """
-    found = {}
-    for cell in matrix.runs:
-        outcome = read_outcome(cell_folder(matrix.folder, cell))
-        if outcome is not None and outcome.failure is not None:
-            found[cell] = outcome.failure
-    return found
 
 
 def comparable(runs: pd.DataFrame) -> pd.DataFrame:
