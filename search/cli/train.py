@@ -43,9 +43,7 @@ def train(
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.callbacks import aulc
-    from sb3_aarl.envs import PREFIX
     from search.studies.single import train_one
-    from search.training.config import import_modules, resolve_env_id
 
     started = time.monotonic()
 
@@ -59,11 +57,9 @@ def train(
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
-    modules = import_modules(imports.split(",") if imports else ())
-    env = resolve_env_id(env)
-    file = find_file(config or Path("aarl_state" if env.startswith(PREFIX) else "default"))
-    curve, path, was_finished = train_one(
-        env, aux_loss, file, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation, modules
+    modules = imports.split(",") if imports else ()
+    curve, path = train_one(
+        env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation, modules
     )
     if json:
         say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})
@@ -74,8 +70,6 @@ def train(
     for point in curve:
         table.add_row(f"{point.environment_steps:,}", f"{point.mean:.1f}", f"{point.std:.1f}", f"{point.seconds:.0f}")
     console.print(table)
-    if was_finished:
-        say("This run was finished before. To train again, name another folder (--folder).")
     say(f"Model: {path / 'model.zip'}\nCurve: {path / 'curve.csv'}")
 
 
