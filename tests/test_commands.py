@@ -104,7 +104,6 @@ def test_a_file_that_is_there_wins(folder: Path) -> None:
         ("baselines cheetah_run_sate", "cheetah_run_state"),
         ("benchmark arl_state --envs cheetah-run", "aarl_state"),
         ("train cheetah-run --config simbaa", "body/simba"),
-        ("evaluate model.zip --config aarl_pixl", "aarl_pixel"),
     ],
 )
 def test_an_unknown_name_has_the_nearest(arguments: str, nearest: str) -> None:

@@ -333,14 +333,6 @@ def test_many_variants_are_told_apart_and_leave_room_for_the_curves(curves):
     assert axes.get_window_extent().height > 150
 
 
-def test_smoothing_is_a_centred_mean_of_each_run(curves):
-    one = curves.query("env == 'walker' and variant == 'aarl' and seed == 0").sort_values("environment_steps")
-    means = one["mean"].to_numpy()
-    line = learning_curves_plot(one.sample(frac=1, random_state=1), smooth=3).axes[0].lines[0]
-    expected = [means[max(0, i - 1) : i + 2].mean() for i in range(len(means))]
-    np.testing.assert_allclose(line.get_ydata(), expected)
-
-
 @pytest.mark.filterwarnings("error")
 def test_plots_of_studies_without_scores():
     table = analysis.trial_table(

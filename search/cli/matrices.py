@@ -186,5 +186,5 @@ def benchmark(
         show_costs(unfinished(matrix), workers)
         return
     train_matrix(matrix, workers)
-    show_benchmark(folder, json=json)
+    show_benchmark(folder, json)
     exit_if_failed(matrix)

@@ -8,7 +8,7 @@ import typer
 from rich.table import Table
 
 from search.cli.console import console, errors, print_wide, say, say_json, time_to_go
-from search.cli.options import SHIPPED, Json, Model, ModelConfig
+from search.cli.options import SHIPPED, Json, Model
 from search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -126,7 +126,6 @@ def init(path: Annotated[Path, typer.Argument(help="File to write, such as own.y
 def evaluate(
     model: Model,
     env: ModelEnv = None,
-    config: ModelConfig = None,
     episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 10,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
     json: Json = False,
@@ -134,7 +133,7 @@ def evaluate(
     """Show the return of a trained model: mean and deviation of episodes with its best actions."""
     import numpy as np
 
-    returns = play(model, env, config, episodes, seed)
+    returns = play(model, env, episodes, seed)
     if json:
         say_json({"mean": float(np.mean(returns)), "std": float(np.std(returns)), "returns": returns})
     else:
@@ -145,7 +144,6 @@ def evaluate(
 def video(
     model: Model,
     env: ModelEnv = None,
-    config: ModelConfig = None,
     episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
     out: Annotated[
@@ -157,22 +155,20 @@ def video(
 
     path = out or (model if model.is_dir() else model.parent) / "video.gif"
     frames: list[Any] = []
-    returns = play(model, env, config, episodes, seed, frames)
+    returns = play(model, env, episodes, seed, frames)
     path.parent.mkdir(parents=True, exist_ok=True)
     # GIF counts in milliseconds, and repeats.
     imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix == ".gif" else {"fps": FPS}))
     say(f"Video: {path}, {len(frames)} pictures, returns {', '.join(f'{value:.1f}' for value in returns)}")
 
 
-def play(
-    model: Path, env: str | None, config: Path | None, episodes: int, seed: int, frames: list[Any] | None = None
-) -> list[float]:
+def play(model: Path, env: str | None, episodes: int, seed: int, frames: list[Any] | None = None) -> list[float]:
     """The returns of a model's episodes, and, where wanted, their pictures."""
     from stable_baselines3.common.evaluation import evaluate_policy
 
     from search.studies.single import load_trained
 
-    trained, environment = load_trained(model, env, config, renders=frames is not None)
+    trained, environment = load_trained(model, env, renders=frames is not None)
     environment.seed(seed)
     film = None if frames is None else lambda *_: frames.append(environment.render())
     returns, _ = evaluate_policy(trained, environment, episodes, callback=film, return_episode_rewards=True)

@@ -212,20 +212,14 @@ def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
     return figure
 
 
-def learning_curves_plot(curves: pd.DataFrame, smooth: int = 1) -> Figure:
+def learning_curves_plot(curves: pd.DataFrame) -> Figure:
     """
     Learning curves with their deviation over seeds, one panel a task: the paper's figure 9.
 
     A point is drawn where all seeds of its variant and task have one. The shade is the standard deviation over the seeds;
     where there is one seed only, over its episodes.
-
-    :param smooth: Evaluations over which each run is averaged, centred; the paper smooths too and does not say how much
     """
     tasks, variants = list(curves["env"].unique()), list(curves["variant"].unique())
-    curves = curves.sort_values("environment_steps")
-    if smooth > 1:
-        runs = curves.groupby(["variant", "env", "seed"])[["mean", "std"]]
-        curves[["mean", "std"]] = runs.transform(lambda run: run.rolling(smooth, center=True, min_periods=1).mean())
     figure, panels = _panels(tasks, columns=4, width=3.3, height=2.7)
     for axes, task in zip(panels, tasks, strict=True):
         for position, variant in enumerate(variants):

@@ -99,9 +99,7 @@ def train_one(
     return train(folder, progress_bar, on_evaluation), folder
 
 
-def load_trained(
-    path: Path, environment: str | None = None, config: Path | None = None, renders: bool = False
-) -> tuple[SACAux, VecEnv]:
+def load_trained(path: Path, environment: str | None = None, renders: bool = False) -> tuple[SACAux, VecEnv]:
     """
     A trained model, and an environment for it: that of the run that it is from, or another one.
 
@@ -117,7 +115,7 @@ def load_trained(
     if environment is None and run is None:
         raise ValueError(f"which environment? {folder} has no {RUN} that names it")
     env_id = resolve_env_id(environment) if environment is not None else run.environment  # type: ignore[union-attr]
-    settings = load_hyperparameters(config, env_id) if config is not None else run.hyperparameters if run is not None else {}
+    settings = run.hyperparameters if run else {}
     env_kwargs = settings.get("env_kwargs") or {}
     if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
         env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}
