@@ -49,6 +49,7 @@ def plant(folder: Path, name: str, seed: int, n_candidates: int, url: str | None
             "curve": curve,
             "device": "CPU: some",
             "threads": 2,
+            "seconds": 9.0,
         }
         params, space = loss_to_params(loss), distributions(loss.horizon)
         trials.append(create_trial(value=score, params=params, distributions=space, user_attrs=attrs))

@@ -63,7 +63,7 @@ def make_trial(number, state, value, duration, loss=None, **attrs):
         datetime_complete=START + timedelta(seconds=duration) if state.is_finished() else None,
         params=loss_to_params(loss),
         distributions=distributions(loss.horizon),
-        user_attrs=attrs,
+        user_attrs={"seconds": float(duration)} | attrs if state.is_finished() and "interrupted" not in attrs else attrs,
         system_attrs={},
         intermediate_values={},
         trial_id=number,

@@ -16,7 +16,7 @@ from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from search.evolution.space import loss_of, loss_to_params
 from search.results.rankings import rank_agreement, rankings
-from search.results.trials import curve_of, lineage, ranked, score_of, seconds_of
+from search.results.trials import curve_of, lineage, ranked, score_of
 
 # Section 3.3, in the order of table 5.
 PATTERNS: Mapping[str, str | AuxLoss] = {
@@ -260,17 +260,15 @@ def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
     Where the trials were trained, and how long it took.
 
-    :return: One row a device and commit, as noted by the driver: finished ``trials``, failed ones included, but not those
-        that were interrupted; their ``hours``, one run after the other; ``core_hours`` (hours x threads; NaN for GPUs and
-        where nothing is noted)
+    :return: One row a device and commit, as noted by the driver: ``trials`` whose seconds it noted, failed ones included, but
+        not those that were interrupted; their ``hours``, one run after the other; ``core_hours`` (hours x threads; NaN for
+        GPUs and where nothing is noted)
     """
     rows = []
-    for trial in trials:
-        seconds, attributes = seconds_of(trial), trial.user_attrs
-        if seconds is not None:
-            device, commit = (str(attributes.get(key, "not noted")) for key in ("device", "commit"))
-            threads = attributes.get("threads", 1) if device.startswith("CPU") else np.nan
-            rows.append((device, commit, seconds / 3600, seconds / 3600 * threads))
+    for attributes in (trial.user_attrs for trial in trials if "seconds" in trial.user_attrs):
+        hours = attributes["seconds"] / 3600
+        device, commit = (str(attributes.get(key, "not noted")) for key in ("device", "commit"))
+        rows.append((device, commit, hours, hours * attributes.get("threads", 1) if device.startswith("CPU") else np.nan))
     table = pd.DataFrame(rows, columns=["device", "commit", "hours", "core_hours"])
     groups = table.groupby(["device", "commit"], sort=False)
     # min_count: the sum of nothing but NaN is NaN.
