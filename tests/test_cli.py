@@ -167,17 +167,15 @@ def test_errors_of_train_are_one_line(arguments: list[str], message: str, folder
 
 
 def test_losses_lists_the_whole_catalogue() -> None:
-    rows = [[cell.strip() for cell in line.split("│")[1:4]] for line in run("losses").splitlines() if line.startswith("│")]
-    table: dict[str, list[str]] = {}
-    for name, notation, operator in rows:
+    rows = [[cell.strip() for cell in line.split("│")[1:3]] for line in run("losses").splitlines() if line.startswith("│")]
+    table: dict[str, str] = {}
+    for name, notation in rows:
         if name:
-            table[name] = [notation, operator]
+            table[name] = notation
         else:  # a long notation continues in the next line
-            table[list(table)[-1]][0] += f" {notation}"
+            table[list(table)[-1]] += f" {notation}"
     assert list(table) == catalog.names()
-    for name, (notation, operator) in table.items():
-        measure, _, negatives = operator.partition(", ")
-        assert AuxLoss.parse(notation, measure, negatives == "negatives") == catalog.load(name)
+    assert all(AuxLoss.parse(notation) == catalog.load(name) for name, notation in table.items())
 
 
 def test_all_files_are_installed() -> None:

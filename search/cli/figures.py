@@ -8,7 +8,7 @@ import typer
 from search.cli import options
 from search.cli.console import say
 from search.cli.options import SearchFolders, Storage, open_studies
-from search.cli.results import patterns_by_name, say_missing
+from search.cli.results import say_missing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -84,10 +84,12 @@ def patterns(
     out: Out = None,
 ) -> None:
     """Scores with and without each pattern of table 5 (figure 11)."""
+    from search.results.analysis import PATTERNS
     from search.results.plots import patterns_plot
 
     studies = open_studies(folders, storage)
-    write_figure(patterns_plot(candidates(studies), patterns_by_name(pattern)), out, "patterns", studies)
+    named = {**PATTERNS, **{text: text for text in pattern or ()}}
+    write_figure(patterns_plot(candidates(studies), named), out, "patterns", studies)
 
 
 def candidates(studies: Studies) -> "dict[str, pd.DataFrame]":

@@ -15,8 +15,6 @@ from search.cli.options import Storage, open_studies, search_folder
 if TYPE_CHECKING:
     import pandas as pd
 
-    from sb3_aarl import AuxLoss
-
 app = typer.Typer()
 # The tables of an analysis in the order in which they are shown, and their titles.
 ANALYSES = {
@@ -76,8 +74,9 @@ def analyze(
     """Show what searches teach about losses: patterns (table 5), importances, effects, diversity, lineage, metrics."""
     from search.results import analysis
 
+    patterns = {**analysis.PATTERNS, **{text: text for text in pattern or ()}}
     summaries = {
-        name: analysis.summary(found.get_trials(deepcopy=False), found.direction, patterns_by_name(pattern))
+        name: analysis.summary(found.get_trials(deepcopy=False), found.direction, patterns)
         for name, (found, _) in open_studies(folders, storage).items()
     }
     if json:
@@ -100,13 +99,6 @@ def analyze(
         layout = analysis.table5_layout({name: summary.tables["table5"] for name, summary in summaries.items()})
         layout = layout.rename_axis("study").reset_index()
         show_table(layout, "Differences of all studies, as the paper's table 5")
-
-
-def patterns_by_name(others: list[str] | None) -> "dict[str, str | AuxLoss]":
-    """The patterns of table 5, and others under their notation."""
-    from search.results import analysis
-
-    return {**analysis.PATTERNS, **{text: text for text in others or ()}}
 
 
 @app.command()

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from search.cli.console import console, errors, print_wide, say, say_json, time_to_go
@@ -85,12 +86,10 @@ def losses(
     if json:
         say_json({name: str(loss) for name, loss in found.items()})
         return
-    table = Table("name", "notation", "operator")
+    table = Table("name", "notation")
     table.columns[1].overflow = "fold"
     for name, loss in found.items():
-        operator = f"{loss.operator}, negatives" if loss.negatives else loss.operator
-        # The brackets behind a notation hold the operator; rich would take them for markup.
-        table.add_row(name, str(loss).partition(" [")[0], operator)
+        table.add_row(name, escape(str(loss)))
     console.print(table)
 
 
