@@ -1,9 +1,11 @@
 """One HTML file on what a search found: self-contained, and readable without JavaScript but for its plots to click."""
 
 import io
+import re
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,6 @@ from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
 from search.execution.matrix import comparable, stored_scores, task_name
 from search.results import analysis
-from search.results.notation import mathml
 from search.results.plots import evolution_figure, patterns_plot, rankings_plot
 from search.results.trials import lineage, ranked
 from search.studies import cross_validation
@@ -94,6 +95,16 @@ def _candidates(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     text = analysis.readable("candidates", table.set_index("number")[["score", "generation", "operation", "parents"]])
     text.insert(0, "Loss", [_typeset(loss) for loss in table["loss"]])
     return text
+
+
+def mathml(loss: AuxLoss) -> str:
+    """The loss as the paper prints it, for HTML: one ``math`` element a token, as browsers break no line inside of one."""
+
+    def token(match: re.Match[str]) -> str:
+        offset = f"<mo>+</mo><mn>{match[2]}</mn>" if match[2] else ""
+        return f"<math><msub><mi>{match[1]}</mi><mrow><mi>t</mi>{offset}</mrow></msub></math>"
+
+    return re.sub(r"\b([sar])_t(?:\+(\d+))?", token, escape(str(loss).replace("->", "→")))
 
 
 def _typeset(loss: AuxLoss | None) -> Markup:
