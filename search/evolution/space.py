@@ -12,7 +12,6 @@ from optuna.trial import FrozenTrial
 from sb3_aarl.aux_loss import LONGEST_HORIZON, OPERATORS, AuxLoss, Token
 
 MAX_HORIZON = 10  # paper, section 2.1
-Bits = tuple[bool, ...]
 
 
 def is_valid(source: Sequence[bool] | np.ndarray, target: Sequence[bool] | np.ndarray) -> bool:
