@@ -47,7 +47,8 @@ def live() -> Iterator[Callable[[str, object], None]]:
     """
     if errors.is_terminal:
         with Live(console=errors, refresh_per_second=2) as display:
-            yield lambda shown, state: display.update(shown)
+            # What is longer than the terminal is wide would be cut.
+            yield lambda shown, state: display.update(shown.replace("; ", "\n"))
         return
     last: object = None
     shown = -LINE_SECONDS
