@@ -26,6 +26,7 @@ import torch as th
 from gymnasium.wrappers import TimeLimit
 from rich.console import Console
 from rich.table import Table
+from saving import save_result
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -33,7 +34,6 @@ from sb3_aarl import SACAux
 from sb3_aarl.callbacks import LearningCurveCallback, SingleEpisodes
 from sb3_aarl.envs import make_dmc_env
 from search.training.config import VEC_ENVS
-from search.training.provenance import save_result
 
 ACTION_REPEAT = 4
 EPISODES = 10

@@ -19,10 +19,10 @@ import torch as th
 from gymnasium import spaces
 from rich.console import Console
 from rich.table import Table
+from saving import save_result
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_aarl.buffers import WindowReplayBuffer
-from search.training.provenance import save_result
 
 IMAGES = spaces.Box(0, 255, (9, 100, 100), np.uint8)
 ACTIONS = spaces.Box(-1, 1, (6,), np.float32)

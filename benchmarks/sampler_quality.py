@@ -21,12 +21,12 @@ from typing import Protocol
 
 import numpy as np
 import optuna
+from saving import save_result
 from scipy.stats import mannwhitneyu
 
 from sb3_aarl.aux_loss import AuxLoss, Token
 from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import MAX_HORIZON, random_loss, suggest_aux_loss
-from search.training.provenance import save_result
 
 N_TOKENS = 3 * MAX_HORIZON + 1
 SAMPLERS: dict[str, Callable[[int], optuna.samplers.BaseSampler]] = {

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import optuna
 from optuna.samplers import BaseSampler, NSGAIISampler
+from saving import save_result
 
 from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import suggest_aux_loss
-from search.training.provenance import save_result
 
 SAMPLERS: dict[str, Callable[[], BaseSampler]] = {
     "AuxLossSampler": lambda: AuxLossSampler(seed=0),

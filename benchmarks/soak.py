@@ -18,10 +18,10 @@ from typing import Any
 import optuna
 import psutil
 from optuna.trial import TrialState
+from saving import save_result
 
 from search.evolution.space import loss_of
 from search.execution.storage import open_storage
-from search.training.provenance import save_result
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from postgres import Postgres

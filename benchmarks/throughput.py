@@ -19,10 +19,9 @@ from typing import Any
 import torch as th
 from rich.console import Console
 from rich.table import Table
+from saving import save_result
 from stable_baselines3.common.logger import configure
 from train_step import BATCH, fill, modes, ours, synchronize
-
-from search.training.provenance import save_result
 
 CANDIDATES = 700
 GRADIENT_STEPS = 500_000 // 4

@@ -28,13 +28,13 @@ import torch as th
 from gymnasium import spaces
 from rich.console import Console
 from rich.table import Table
+from saving import save_result
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_aarl import SACAux
 from sb3_aarl.encoders import PixelEncoder
-from search.training.provenance import save_result
 
 ACTION_DIM = 6
 STATE_DIM = 17

@@ -10,7 +10,7 @@ import pytest
 from tiny import YAML
 
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
-from search.execution.matrix import Cell, cell_folder, failures, run_matrix
+from search.execution.matrix import Cell, cell_folder, run_matrix
 from search.execution.runs import LocalExecutor
 from search.results import table
 from search.studies import benchmark
@@ -18,7 +18,7 @@ from search.studies.benchmark import load_benchmark, parse_seeds, parse_steps, r
 from search.training import provenance
 from search.training.config import load_hyperparameters
 from search.training.provenance import ABOUT, read_about, write_about
-from search.training.run import prepare_run, train
+from search.training.run import prepare_run, read_outcome, train
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 OWN = YAML.replace("default:", "Pendulum-v1:\n  aux_loss: curl\n  n_timesteps: 400")
@@ -180,8 +180,10 @@ def test_runs_are_those_without_a_benchmark_and_what_fails_does_not_hide_the_oth
         (*_, last) = run_matrix(matrix, executor, workers=2)
     assert (last.finished, last.failed) == (1, 1)
     mine, bursts = matrix.runs
-    ((failed, reason),) = failures(matrix).items()
-    assert failed == bursts
+    outcomes = [read_outcome(cell_folder(Path("out"), cell)) for cell in (mine, bursts)]
+    assert outcomes[0] is not None and outcomes[0].failure is None and outcomes[1] is not None
+    reason = outcomes[1].failure
+    assert reason
     runs = table.read_runs(Path("out")).set_index("variant")
     assert runs["mean"].notna().to_dict() == {"mine": True, "bursts": False} and runs.loc["bursts", "reason"] == reason
 

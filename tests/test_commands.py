@@ -104,7 +104,6 @@ def test_a_file_that_is_there_wins(folder: Path) -> None:
         ("baselines cheetah_run_sate", "cheetah_run_state"),
         ("benchmark arl_state --envs cheetah-run", "aarl_state"),
         ("train cheetah-run --config simbaa", "body/simba"),
-        ("evaluate model.zip --config aarl_pixl", "aarl_pixel"),
     ],
 )
 def test_an_unknown_name_has_the_nearest(arguments: str, nearest: str) -> None:
@@ -173,7 +172,7 @@ def test_status_of_a_search_and_its_baselines(folder: Path) -> None:
     assert data["search"]["best_loss"] in shown and f"score {data['search']['best']:.2f}; 0:00:00 to go" in shown
     run("baselines", "small.yml")
     shown, data = run("status"), json.loads(run("status", "small", "--json"))
-    assert set(json.loads(run("baselines", "small.yml", "--json", stdout=True))) == {"ranked", "others"}
+    assert {row["variant"] for row in json.loads(run("baselines", "small.yml", "--json", stdout=True))} == {"CURL", "SAC"}
     score = np.mean([point.mean for point in read_curve("runs/small/baselines/SAC/Pendulum-v1/seed-0/curve.csv")])
     assert [row["variant"] for row in data["baselines"]["variants"]] == ["CURL", "SAC"]
     assert re.search(rf"SAC +│ +1 │ +1 │ +0 │ +0 │ +{score:.2f} ", shown)

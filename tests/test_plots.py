@@ -26,7 +26,7 @@ from search.results.plots import (
     patterns_plot,
     rankings_plot,
 )
-from search.results.trials import lineage, ranked, seconds_of
+from search.results.trials import lineage, ranked
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 BASELINES = [("SAC", 12.5), ("<b>CURL</b>", -3.0)]
@@ -119,18 +119,6 @@ def test_lineage_reaches_every_ancestor_and_the_first_line_first():
             number = parents[number][0]
             line.append(number)
         assert found[: len(line)] == line
-
-
-def test_seconds_are_those_noted_by_the_driver():
-    start = pd.Timestamp("2026-01-01").to_pydatetime()
-    trials = make_trials(
-        make_trial(1.0, seconds=12.5),
-        make_trial(1.0),
-        make_trial(state=TrialState.FAIL, interrupted=True),
-        make_trial(state=TrialState.RUNNING, seconds=1.0),
-    )
-    trials[1].datetime_start, trials[1].datetime_complete = start, start + pd.Timedelta(minutes=2)
-    assert [seconds_of(trial) for trial in trials] == [12.5, 120.0, None, None]
 
 
 def texts(figure):
@@ -331,14 +319,6 @@ def test_many_variants_are_told_apart_and_leave_room_for_the_curves(curves):
         warnings.simplefilter("error")  # matplotlib's, that nothing is left of the axes
         check_drawing(figure)
     assert axes.get_window_extent().height > 150
-
-
-def test_smoothing_is_a_centred_mean_of_each_run(curves):
-    one = curves.query("env == 'walker' and variant == 'aarl' and seed == 0").sort_values("environment_steps")
-    means = one["mean"].to_numpy()
-    line = learning_curves_plot(one.sample(frac=1, random_state=1), smooth=3).axes[0].lines[0]
-    expected = [means[max(0, i - 1) : i + 2].mean() for i in range(len(means))]
-    np.testing.assert_allclose(line.get_ydata(), expected)
 
 
 @pytest.mark.filterwarnings("error")

@@ -24,8 +24,7 @@ from sb3_aarl.callbacks import Evaluation, write_curve
 from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
 from search.execution.matrix import Cell, cell_folder, stored_scores
 from search.results import analysis
-from search.results.notation import mathml
-from search.results.report import generation_table, stored_baselines, write_report
+from search.results.report import generation_table, mathml, stored_baselines, write_report
 from search.training.provenance import write_about
 from search.training.run import Run, prepare_run
 
@@ -63,7 +62,7 @@ def make_trial(number, state, value, duration, loss=None, **attrs):
         datetime_complete=START + timedelta(seconds=duration) if state.is_finished() else None,
         params=loss_to_params(loss),
         distributions=distributions(loss.horizon),
-        user_attrs=attrs,
+        user_attrs={"seconds": float(duration)} | attrs if state.is_finished() and "interrupted" not in attrs else attrs,
         system_attrs={},
         intermediate_values={},
         trial_id=number,

@@ -12,9 +12,9 @@ import pytest
 from tiny import tiny_run
 
 from sb3_aarl.callbacks import read_curve
-from search.execution.matrix import Cell, Matrix, cell_folder, comparable, failures, run_matrix, scores
+from search.execution.matrix import Cell, Matrix, cell_folder, comparable, run_matrix, scores
 from search.execution.runs import LocalExecutor, Submission, mean_curve, start_run
-from search.training.run import is_finished, prepare_run, train
+from search.training.run import is_finished, prepare_run, read_outcome, train
 
 pytestmark = pytest.mark.slow
 
@@ -91,7 +91,8 @@ def test_a_matrix_trains_what_is_missing_and_names_what_failed(tmp_path: Path, u
     with LocalExecutor(2) as executor:
         progress = list(run_matrix(matrix, executor, workers=2, retries=0))[-1]
     assert progress[:3] == (3, 2, 1)
-    assert list(failures(matrix)) == [Cell(bad, "Pendulum-v1", 0)]
+    outcomes = {cell: read_outcome(cell_folder(tmp_path, cell)) for cell in runs}
+    assert [cell for cell, outcome in outcomes.items() if outcome and outcome.failure] == [Cell(bad, "Pendulum-v1", 0)]
     table = scores(matrix).set_index("variant")
     assert table.loc["forward-dynamics", "last"] == undisturbed[-1][1]
     assert table.loc["forward-dynamics", "score"] == pytest.approx(sum(mean for _, mean in undisturbed) / 2)

@@ -118,7 +118,7 @@ def reference(settings: dict[str, Any], sign: float) -> list[list[Row]]:
             known = generations[: number - 1 - (operation == "random")]
             drawn: list[tuple[AuxLoss, list[int]]] = []
             while len(drawn) < (settings["screening"] if known else 1):
-                with contextlib.suppress(mutations.RejectedLoss):
+                with contextlib.suppress(ValueError):
                     candidate = offspring(rng, operation, slot, parents, settings["max_horizon"])
                     drawn += [candidate] * (candidate[0].canonical() not in seen)
             best = 0 if len(drawn) == 1 else choice(rng, known, [loss for loss, _ in drawn], settings["max_horizon"], sign)
@@ -144,7 +144,7 @@ def offspring(
         return mutations.horizon_change(loss, rng, max_horizon), [mother]
     partners = [(at, other) for _, at, other in parents if at != mother and other.horizon == loss.horizon]
     if not partners:
-        raise mutations.RejectedLoss
+        raise ValueError
     father, other = partners[rng.integers(len(partners))]
     return mutations.crossover(loss, other, rng), [mother, father]
 

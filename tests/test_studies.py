@@ -207,14 +207,15 @@ def test_one_run_keeps_its_model_and_is_not_repeated(tmp_path: Path, monkeypatch
     Path("own.yml").write_text(YAML + "  n_timesteps: 205\n")
     Path("winner.yml").write_text(yaml.safe_dump({"aux_loss": LOSSES[0]}))
     arguments: dict[str, Any] = {"environment": "Pendulum-v1", "config": "own.yml", "evaluation_episodes": 1, "seed": 3}
-    curve, folder, was_finished = train_one(aux_loss="winner.yml", n_evaluations=2, **arguments)
-    assert folder.parent == Path("runs") and folder.name.startswith("pendulum-v1-winner-yml-") and not was_finished
+    curve, folder = train_one(aux_loss="winner.yml", n_evaluations=2, **arguments)
+    assert folder.parent == Path("runs") and folder.name.startswith("pendulum-v1-winner-yml-")
     assert [point.environment_steps for point in curve] == [102, 204] and curve == read_curve(folder / "curve.csv")
     model = SACAux.load(folder / "model.zip")
     assert model.num_timesteps == 204 and model.aux_loss == LOSSES[0]
     about = json.loads((folder / "provenance.json").read_text())
     assert about["sessions"][0]["aux_loss"] == str(LOSSES[0]) and about["seconds"] > 0
-    assert train_one(aux_loss=str(LOSSES[0]), n_evaluations=2, folder=folder, **arguments) == (curve, folder, True)
+    # The seconds of the curve too.
+    assert train_one(aux_loss=str(LOSSES[0]), n_evaluations=2, folder=folder, **arguments) == (curve, folder)
     with pytest.raises(ValueError, match=f"{folder} has another run: aux_loss is"):
         train_one(aux_loss="none", n_evaluations=2, folder=folder, **arguments)
 

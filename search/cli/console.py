@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, RenderableType
+from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
@@ -40,19 +40,20 @@ def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
 
 
 @contextlib.contextmanager
-def live() -> Iterator[Callable[[RenderableType, object], None]]:
+def live() -> Iterator[Callable[[str, object], None]]:
     """
     A function that shows progress, on stderr: in place on a terminal; elsewhere, as in a job's log, as one more line with the
     time where the state has changed, and every ten minutes.
     """
     if errors.is_terminal:
         with Live(console=errors, refresh_per_second=2) as display:
-            yield lambda shown, state: display.update(shown)
+            # What is longer than the terminal is wide would be cut.
+            yield lambda shown, state: display.update(shown.replace("; ", "\n"))
         return
     last: object = None
     shown = -LINE_SECONDS
 
-    def show(line: RenderableType, state: object) -> None:
+    def show(line: str, state: object) -> None:
         nonlocal last, shown
         if state != last or time.monotonic() - shown > LINE_SECONDS:
             last, shown = state, time.monotonic()

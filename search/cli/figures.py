@@ -8,7 +8,7 @@ import typer
 from search.cli import options
 from search.cli.console import say
 from search.cli.options import SearchFolders, Storage, open_studies
-from search.cli.results import patterns_by_name, say_missing
+from search.cli.results import say_missing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,7 +51,6 @@ def histogram(
 @app.command()
 def curves(
     folder: options.Benchmark = Path("runs/benchmark"),
-    smooth: Annotated[int, typer.Option(help="Evaluations over which each run is averaged, centred.", min=1)] = 1,
     out: Out = None,
 ) -> None:
     """Learning curves of a benchmark with their deviation over seeds (figure 9)."""
@@ -59,7 +58,7 @@ def curves(
     from search.results.table import read_runs
     from search.studies.benchmark import read_curves
 
-    write_figure(learning_curves_plot(read_curves(folder), smooth), out or folder / "curves.png")
+    write_figure(learning_curves_plot(read_curves(folder)), out or folder / "curves.png")
     say_missing(read_runs(folder))
 
 
@@ -67,7 +66,6 @@ def curves(
 def rankings(
     folder: options.SearchFolder = None,
     storage: Storage = None,
-    top: options.Top = 10,
     out: Out = None,
 ) -> None:
     """Learning curves of the best candidates under three metrics (figure 10)."""
@@ -75,7 +73,7 @@ def rankings(
 
     studies = open_studies([folder], storage)
     (table,) = candidates(studies).values()
-    write_figure(rankings_plot(table, top), out, "rankings", studies)
+    write_figure(rankings_plot(table), out, "rankings", studies)
 
 
 @app.command()
@@ -86,10 +84,12 @@ def patterns(
     out: Out = None,
 ) -> None:
     """Scores with and without each pattern of table 5 (figure 11)."""
+    from search.results.analysis import PATTERNS
     from search.results.plots import patterns_plot
 
     studies = open_studies(folders, storage)
-    write_figure(patterns_plot(candidates(studies), patterns_by_name(pattern)), out, "patterns", studies)
+    named = {**PATTERNS, **{text: text for text in pattern or ()}}
+    write_figure(patterns_plot(candidates(studies), named), out, "patterns", studies)
 
 
 def candidates(studies: Studies) -> "dict[str, pd.DataFrame]":

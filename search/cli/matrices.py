@@ -46,21 +46,15 @@ def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
 def compare(
     matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str, json: bool
 ) -> "pd.DataFrame | None":
-    """Show a table of the variants that can be compared, and return it; show the scores of the others beside it."""
+    """Show a table of the variants that can be compared, and return it."""
     from search.execution.matrix import comparable, scores
-    from search.studies.cross_validation import ranking
 
-    runs = scores(matrix)
-    compared = comparable(runs)
-    others = runs.drop(compared.index)
+    compared = comparable(scores(matrix))
     ranked = None if compared.empty else table(compared)
     if json:
-        say_json({"ranked": [] if ranked is None else records(ranked), "others": records(ranking(others))})
-        return ranked
-    if ranked is not None:
+        say_json([] if ranked is None else records(ranked))
+    elif ranked is not None:
         show_table(texts(ranked), title)
-    if not others.empty:
-        show_table(texts(ranking(others)), "Not ranked, because runs are missing: AULC of those that are finished")
     return ranked
 
 
@@ -76,9 +70,11 @@ def texts(frame: "pd.DataFrame") -> "pd.DataFrame":
 
 def exit_if_failed(matrix: "Matrix") -> None:
     """Name the runs that failed, in one line each; exit code 1 if there are any."""
-    from search.execution.matrix import failures
+    from search.execution.matrix import cell_folder
+    from search.training.run import read_outcome
 
-    found = failures(matrix)
+    outcomes = {cell: read_outcome(cell_folder(matrix.folder, cell)) for cell in matrix.runs}
+    found = {cell: outcome.failure for cell, outcome in outcomes.items() if outcome and outcome.failure is not None}
     for cell, reason in found.items():
         line = f"Failed: {cell.variant} on {cell.environment}, seed {cell.seed}: {reason}"
         errors.print(line, style="red", markup=False, highlight=False)
@@ -190,5 +186,5 @@ def benchmark(
         show_costs(unfinished(matrix), workers)
         return
     train_matrix(matrix, workers)
-    show_benchmark(folder, json=json)
+    show_benchmark(folder, json)
     exit_if_failed(matrix)

@@ -26,14 +26,6 @@ DryRun = Annotated[
 ]
 Json = Annotated[bool, Option("--json", help="Print JSON instead.")]
 Model = Annotated[Path, Argument(help="Model of SACAux, such as model.zip, or the folder of a run that has one.")]
-ModelConfig = Annotated[
-    Path | None,
-    Option(
-        "--config",
-        callback=lambda path: path and find_file(path),
-        help=f"Whose env_kwargs count: {SHIPPED}. Default: what the model's run was trained with.",
-    ),
-]
 Folder = Annotated[Path | None, Option(help="Folder of the search. Default: runs/ and the name of the configuration file.")]
 Benchmark = Annotated[Path, Argument(help="Folder of a benchmark.")]
 SearchFolder = Annotated[
@@ -55,7 +47,6 @@ Patterns = Annotated[
     list[str] | None,
     Option(help='A pattern beside those of table 5, in notation or by name, such as "{s_t} -> {r_t}"; may be repeated.'),
 ]
-Top = Annotated[int, Option(help="How many of the best candidates the metrics are compared on.", min=1)]
 
 
 def read_config(path: Path, **changes: Any) -> "SearchConfig":

@@ -3,7 +3,7 @@
 import math
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -14,8 +14,6 @@ from search.cli.options import Storage, open_studies, search_folder
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from sb3_aarl import AuxLoss
 
 app = typer.Typer()
 # The tables of an analysis in the order in which they are shown, and their titles.
@@ -28,7 +26,7 @@ ANALYSES = {
     "operation": "Scores by operation; difference to all others",
     "diversity": "Diversity of the generations",
     "lineage": "Lineage of the best; gain over the better parent",
-    "rank_agreement": "Agreement of the metrics; shared among the best {top}",
+    "rank_agreement": "Agreement of the metrics; shared among the best 10",
     "machines": "Machines and time",
 }
 N_IMPORTANCES = 20
@@ -37,24 +35,17 @@ N_IMPORTANCES = 20
 @app.command()
 def table(
     folder: options.Benchmark = Path("runs/benchmark"),
-    number: Annotated[
-        Literal["3", "4", "6"] | None,
-        typer.Option("--table", help="Table of the paper. Default: that with most of the variants."),
-    ] = None,
-    csv: Annotated[Path | None, typer.Option(help="File to write the scores to, one line for each cell.")] = None,
     json: options.Json = False,
 ) -> None:
     """Show a benchmark beside the paper's tables, with interquartile means and probabilities of improvement."""
-    show_benchmark(folder, None if number is None else int(number), csv, json)
+    show_benchmark(folder, json)
 
 
-def show_benchmark(folder: Path, number: int | None = None, csv: Path | None = None, json: bool = False) -> None:
-    """Show the tables of a benchmark, as JSON with every run, and write its scores to a file."""
+def show_benchmark(folder: Path, json: bool = False) -> None:
+    """Show the tables of a benchmark, as JSON with every run."""
     from search.results import table as tables
 
-    found = tables.read_tables(folder, number)
-    if csv is not None:
-        found.comparison.to_csv(csv, index=False)
+    found = tables.read_tables(folder)
     if json:
         say_json(tables.as_data(found))
         return
@@ -78,22 +69,16 @@ def analyze(
     folders: options.SearchFolders = None,
     storage: Storage = None,
     pattern: options.Patterns = None,
-    top: options.Top = 10,
-    csv: Annotated[Path | None, typer.Option(help="Folder to write every table to, as NAME-TABLE.csv.")] = None,
     json: options.Json = False,
 ) -> None:
     """Show what searches teach about losses: patterns (table 5), importances, effects, diversity, lineage, metrics."""
     from search.results import analysis
 
+    patterns = {**analysis.PATTERNS, **{text: text for text in pattern or ()}}
     summaries = {
-        name: analysis.summary(found.get_trials(deepcopy=False), found.direction, patterns_by_name(pattern), top)
+        name: analysis.summary(found.get_trials(deepcopy=False), found.direction, patterns)
         for name, (found, _) in open_studies(folders, storage).items()
     }
-    if csv is not None:
-        csv.mkdir(parents=True, exist_ok=True)
-        for name, summary in summaries.items():
-            for title, frame in summary.tables.items():
-                frame.to_csv(csv / f"{name.replace('/', '_')}-{title}.csv")
     if json:
         data = {
             name: {**{title: records(frame) for title, frame in tables.items()}, "problems": problems}
@@ -107,20 +92,13 @@ def analyze(
             if title in summary.tables:
                 frame = summary.tables[title]
                 frame = frame.head(N_IMPORTANCES) if title == "importances" else frame
-                show_table(analysis.readable(title, frame), heading.format(top=top))
+                show_table(analysis.readable(title, frame), heading)
             elif title in summary.problems:
-                say(f"{heading.format(top=top)}: {summary.problems[title]}")
+                say(f"{heading}: {summary.problems[title]}")
     if len(summaries) > 1:
         layout = analysis.table5_layout({name: summary.tables["table5"] for name, summary in summaries.items()})
         layout = layout.rename_axis("study").reset_index()
         show_table(layout, "Differences of all studies, as the paper's table 5")
-
-
-def patterns_by_name(others: list[str] | None) -> "dict[str, str | AuxLoss]":
-    """The patterns of table 5, and others under their notation."""
-    from search.results import analysis
-
-    return {**analysis.PATTERNS, **{text: text for text in others or ()}}
 
 
 @app.command()
@@ -182,7 +160,6 @@ def number(value: float | None) -> str:
 def report(
     folder: options.SearchFolder = None,
     storage: Storage = None,
-    benchmark: Annotated[Path | None, typer.Option(help="Folder of a benchmark whose tables and curves it shows too.")] = None,
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
     """Write a report of a search as one HTML file."""
@@ -191,7 +168,7 @@ def report(
 
     ((searched, path),) = open_studies([folder], storage).values()
     out = out or path / "report.html"
-    write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"), benchmark)
+    write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"))
     say(f"Report: {out}")
 
 

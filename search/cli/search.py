@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
-from search.cli.console import errors, live, say, show_costs, time_to_go
+from search.cli.console import live, say, show_costs, time_to_go
 from search.cli.options import DryRun, Folder, SearchFile, Storage, Threads, read_config, run_folder
 
 if TYPE_CHECKING:
@@ -118,18 +117,8 @@ def show_progress(progresses: "Iterable[SearchProgress]") -> "SearchProgress | N
     shown = None
     with live() as show:
         for shown in progresses:
-            show(progress_table(shown) if errors.is_terminal else progress_line(shown), shown.generations)
+            show(progress_line(shown), shown.generations)
     return shown
-
-
-def progress_table(progress: "SearchProgress") -> Table:
-    """Progress for a terminal."""
-    table = Table("generation", "slots", "done", "running", "failed", title=summary(progress))
-    for column in table.columns:
-        column.justify = "right"
-    for row in progress.generations:
-        table.add_row(*map(str, (row.generation, row.slots, row.filled, row.running, row.failed)))
-    return table
 
 
 def progress_line(progress: "SearchProgress") -> str:
@@ -138,10 +127,5 @@ def progress_line(progress: "SearchProgress") -> str:
         f"generation {row.generation}: {row.filled}/{row.slots} done, {row.running} running, {row.failed} failed"
         for row in progress.generations
     ]
-    return "; ".join([*rows, summary(progress)])
-
-
-def summary(progress: "SearchProgress") -> str:
-    """The best score so far and the time to go."""
     best = "-" if progress.best is None else f"{progress.best:.2f}"
-    return f"best {best}, {time_to_go(progress.seconds_to_go)}"
+    return "; ".join([*rows, f"best {best}, {time_to_go(progress.seconds_to_go)}"])

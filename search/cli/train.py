@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from search.cli.console import console, errors, print_wide, say, say_json, time_to_go
-from search.cli.options import SHIPPED, Json, Model, ModelConfig
+from search.cli.options import SHIPPED, Json, Model
 from search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -43,9 +44,7 @@ def train(
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.callbacks import aulc
-    from sb3_aarl.envs import PREFIX
     from search.studies.single import train_one
-    from search.training.config import import_modules, resolve_env_id
 
     started = time.monotonic()
 
@@ -59,11 +58,9 @@ def train(
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
-    modules = import_modules(imports.split(",") if imports else ())
-    env = resolve_env_id(env)
-    file = find_file(config or Path("aarl_state" if env.startswith(PREFIX) else "default"))
-    curve, path, was_finished = train_one(
-        env, aux_loss, file, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation, modules
+    modules = imports.split(",") if imports else ()
+    curve, path = train_one(
+        env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation, modules
     )
     if json:
         say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})
@@ -74,8 +71,6 @@ def train(
     for point in curve:
         table.add_row(f"{point.environment_steps:,}", f"{point.mean:.1f}", f"{point.std:.1f}", f"{point.seconds:.0f}")
     console.print(table)
-    if was_finished:
-        say("This run was finished before. To train again, name another folder (--folder).")
     say(f"Model: {path / 'model.zip'}\nCurve: {path / 'curve.csv'}")
 
 
@@ -91,12 +86,10 @@ def losses(
     if json:
         say_json({name: str(loss) for name, loss in found.items()})
         return
-    table = Table("name", "notation", "operator")
+    table = Table("name", "notation")
     table.columns[1].overflow = "fold"
     for name, loss in found.items():
-        operator = f"{loss.operator}, negatives" if loss.negatives else loss.operator
-        # The brackets behind a notation hold the operator; rich would take them for markup.
-        table.add_row(name, str(loss).partition(" [")[0], operator)
+        table.add_row(name, escape(str(loss)))
     console.print(table)
 
 
@@ -132,7 +125,6 @@ def init(path: Annotated[Path, typer.Argument(help="File to write, such as own.y
 def evaluate(
     model: Model,
     env: ModelEnv = None,
-    config: ModelConfig = None,
     episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 10,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
     json: Json = False,
@@ -140,7 +132,7 @@ def evaluate(
     """Show the return of a trained model: mean and deviation of episodes with its best actions."""
     import numpy as np
 
-    returns = play(model, env, config, episodes, seed)
+    returns = play(model, env, episodes, seed)
     if json:
         say_json({"mean": float(np.mean(returns)), "std": float(np.std(returns)), "returns": returns})
     else:
@@ -151,7 +143,6 @@ def evaluate(
 def video(
     model: Model,
     env: ModelEnv = None,
-    config: ModelConfig = None,
     episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
     out: Annotated[
@@ -163,22 +154,20 @@ def video(
 
     path = out or (model if model.is_dir() else model.parent) / "video.gif"
     frames: list[Any] = []
-    returns = play(model, env, config, episodes, seed, frames)
+    returns = play(model, env, episodes, seed, frames)
     path.parent.mkdir(parents=True, exist_ok=True)
     # GIF counts in milliseconds, and repeats.
     imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix == ".gif" else {"fps": FPS}))
     say(f"Video: {path}, {len(frames)} pictures, returns {', '.join(f'{value:.1f}' for value in returns)}")
 
 
-def play(
-    model: Path, env: str | None, config: Path | None, episodes: int, seed: int, frames: list[Any] | None = None
-) -> list[float]:
+def play(model: Path, env: str | None, episodes: int, seed: int, frames: list[Any] | None = None) -> list[float]:
     """The returns of a model's episodes, and, where wanted, their pictures."""
     from stable_baselines3.common.evaluation import evaluate_policy
 
     from search.studies.single import load_trained
 
-    trained, environment = load_trained(model, env, config, renders=frames is not None)
+    trained, environment = load_trained(model, env, renders=frames is not None)
     environment.seed(seed)
     film = None if frames is None else lambda *_: frames.append(environment.render())
     returns, _ = evaluate_policy(trained, environment, episodes, callback=film, return_episode_rewards=True)

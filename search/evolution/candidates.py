@@ -47,9 +47,6 @@ class Candidates:
     They are planned in rounds. Round g starts when generation g - 1 is over. It has the slots of generation g that need
     parents (in the first one all), and then the random ones of generation g + 1. It knows nothing of its own results, so
     that the plan does not depend on the order in which trials finish.
-
-    :param sampler: The settings
-    :param seed: Seed of the study
     """
 
     def __init__(self, sampler: "AuxLossSampler", seed: int):
@@ -134,7 +131,7 @@ class Candidates:
         """One offspring, redrawn while it is invalid or known."""
         candidate = None
         for _ in range(MAX_DRAWS):
-            with contextlib.suppress(mutations.RejectedLoss):
+            with contextlib.suppress(ValueError):
                 candidate = self._offspring(rng, operation, slot)
                 if self.sampler.allow_duplicates or not is_known(candidate.loss.canonical()):
                     return candidate
@@ -162,6 +159,6 @@ class Candidates:
             return Candidate(mutations.horizon_change(parent.loss, rng, max_horizon), operation, (parent.number,))
         partners = [other for other in self.parents if other is not parent and other.loss.horizon == parent.loss.horizon]
         if not partners:
-            raise mutations.RejectedLoss(f"no other parent has horizon {parent.loss.horizon}")
+            raise ValueError(f"no other parent has horizon {parent.loss.horizon}")
         other = partners[rng.integers(len(partners))]
         return Candidate(mutations.crossover(parent.loss, other.loss, rng), operation, (parent.number, other.number))

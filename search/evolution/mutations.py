@@ -5,17 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution.space import MAX_HORIZON, Bits, is_valid, random_operator
-
-
-class RejectedLoss(ValueError):
-    """A mutation returned what is no valid loss (paper, A.3: it is redrawn)."""
-
-
-def _build(horizon: int, source: Bits, target: Bits, operator: str, negatives: bool) -> AuxLoss:
-    if not is_valid(source, target):
-        raise RejectedLoss(f"no state in the source {source}, or an empty target {target}")
-    return AuxLoss(horizon, source, target, operator, negatives)
+from search.evolution.space import MAX_HORIZON, random_operator
 
 
 def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str] | None = None) -> AuxLoss:
@@ -23,7 +13,7 @@ def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str
     Flip each bit of both masks with probability 1 / (2 (3k + 1)), k being the horizon, independently. Where operators are
     searched too (the paper does not say how), the operator is redrawn and negatives are switched with the same probability.
 
-    :raises RejectedLoss: when the offspring is not valid
+    :raises ValueError: when the offspring is not valid (paper, A.3: it is redrawn)
     """
     flip_rate = 1 / (2 * (3 * loss.horizon + 1))
     flips = rng.random((2, 3 * loss.horizon + 1)) < flip_rate
@@ -32,19 +22,19 @@ def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str
     if operators is not None:
         operator = random_operator(rng, operators)[0] if rng.random() < flip_rate else operator
         negatives ^= bool(rng.random() < flip_rate)
-    return _build(loss.horizon, tuple(source), tuple(target), operator, negatives)
+    return AuxLoss(loss.horizon, source, target, operator, negatives)
 
 
 def crossover(loss: AuxLoss, other: AuxLoss, rng: np.random.Generator) -> AuxLoss:
     """
     Take each bit of both masks, and the operator, from one of two parents of one horizon at random.
 
-    :raises RejectedLoss: when the offspring is not valid
+    :raises ValueError: when the offspring is not valid
     """
     from_other = rng.random((2, 3 * loss.horizon + 1)) < 0.5
     source, target = np.where(from_other, (other.source, other.target), (loss.source, loss.target)).tolist()
     operator = loss if rng.random() < 0.5 else other
-    return _build(loss.horizon, tuple(source), tuple(target), operator.operator, operator.negatives)
+    return AuxLoss(loss.horizon, source, target, operator.operator, operator.negatives)
 
 
 def horizon_change(loss: AuxLoss, rng: np.random.Generator, max_horizon: int = MAX_HORIZON) -> AuxLoss:
@@ -52,15 +42,15 @@ def horizon_change(loss: AuxLoss, rng: np.random.Generator, max_horizon: int = M
     Drop the last step (action, reward, state) of both masks, or append three random bits to each. Both ways are equally
     probable; at the ends of 1..max_horizon only one is left.
 
-    :raises RejectedLoss: when the offspring is not valid, or the space has one horizon only
+    :raises ValueError: when the offspring is not valid, or the space has one horizon only
     """
     ways = [change for change in (-1, 1) if 1 <= loss.horizon + change <= max_horizon]
     if not ways:
-        raise RejectedLoss(f"the horizon of {loss} cannot change between 1 and {max_horizon}")
+        raise ValueError(f"the horizon of {loss} cannot change between 1 and {max_horizon}")
     change = ways[rng.integers(len(ways))]
     if change < 0:
         source, target = loss.source[:-3], loss.target[:-3]
     else:
         added = (rng.random((2, 3)) < 0.5).tolist()
         source, target = loss.source + tuple(added[0]), loss.target + tuple(added[1])
-    return _build(loss.horizon + change, source, target, loss.operator, loss.negatives)
+    return AuxLoss(loss.horizon + change, source, target, loss.operator, loss.negatives)

@@ -7,6 +7,7 @@ import threading
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,11 +27,6 @@ SLOT_KEY = "AuxLossSampler:slot"
 SETTINGS_KEY = "AuxLossSampler:settings"
 # Optuna's: what study.enqueue_trial was given.
 FIXED_KEY = "fixed_params"
-# Settings that a study keeps. n_generations is not among them: a search may be continued.
-SETTINGS = (
-    *("population_size", "n_random", "n_prior", "parents", "replacement", "crossover", "horizon_change", "random"),
-    *("max_horizon", "operators", "allow_duplicates", "screening", "initial"),
-)
 # Threads of study.optimize share a sampler.
 LOCK = threading.Lock()
 
@@ -45,6 +41,7 @@ class GenerationProgress(NamedTuple):
     failed: int
 
 
+@dataclass(eq=False, repr=False)
 class AuxLossSampler(BaseSampler):
     """
     Evolution of auxiliary losses with the paper's mutations, for ``suggest_aux_loss``.
@@ -82,53 +79,39 @@ class AuxLossSampler(BaseSampler):
     :raises ValueError: naming the argument that does not fit
     """
 
-    def __init__(
-        self,
-        population_size: int = 100,
-        n_random: int = 100,
-        n_prior: int = 25,
-        parents: float = 0.25,
-        replacement: float = 0.5,
-        crossover: float = 0.2,
-        horizon_change: float = 0.1,
-        random: float = 0.2,
-        max_horizon: int = space.MAX_HORIZON,
-        operators: Sequence[str] | None = None,
-        allow_duplicates: bool = False,
-        seed: int | None = None,
-        screening: int = 1,
-        n_generations: int | None = None,
-        initial: Sequence[AuxLoss] = (),
-    ):
-        self.population_size = population_size
-        self.n_random = n_random
-        self.n_prior = n_prior
-        self.parents = parents
-        self.replacement = replacement
-        self.crossover = crossover
-        self.horizon_change = horizon_change
-        self.random = random
-        self.max_horizon = max_horizon
-        self.operators = None if operators is None else tuple(operators)
-        self.allow_duplicates = allow_duplicates
-        self.seed = seed
-        self.screening = screening
-        self.n_generations = n_generations
-        self.initial = tuple(initial if allow_duplicates else {loss.canonical(): loss for loss in initial}.values())
-        self._check_arguments()
+    population_size: int = 100
+    n_random: int = 100
+    n_prior: int = 25
+    parents: float = 0.25
+    replacement: float = 0.5
+    crossover: float = 0.2
+    horizon_change: float = 0.1
+    random: float = 0.2
+    max_horizon: int = space.MAX_HORIZON
+    operators: Sequence[str] | None = None
+    allow_duplicates: bool = False
+    seed: int | None = None
+    screening: int = 1
+    n_generations: int | None = None
+    initial: Sequence[AuxLoss] = ()
+
+    def __post_init__(self) -> None:
+        self.operators = None if self.operators is None else tuple(self.operators)
+        losses = self.initial if self.allow_duplicates else {loss.canonical(): loss for loss in self.initial}.values()
+        self.initial = tuple(losses)
+        shares = {name: getattr(self, name) for name in ("random", "replacement", "crossover", "horizon_change")}
+        self._check_arguments(shares)
         # Operations of all slots. Random ones come first in later generations: they need no parents.
-        self._first = ["given"] * len(self.initial) + ["random"] * n_random + ["prior"] * n_prior
-        shares = {"random": random, "replacement": replacement, "crossover": crossover, "horizon_change": horizon_change}
-        self._later = [name for name, count in _apportion(shares, population_size).items() for _ in range(count)]
+        self._first = ["given"] * len(self.initial) + ["random"] * self.n_random + ["prior"] * self.n_prior
+        self._later = [name for name, count in _apportion(shares, self.population_size).items() for _ in range(count)]
         self._cached: tuple[Any, int, _Slots] | None = None  # storage, study and what is known of its slots
 
-    def _check_arguments(self) -> None:
+    def _check_arguments(self, shares: dict[str, float]) -> None:
         positive = {name: getattr(self, name) for name in ("population_size", "max_horizon", "screening", "n_generations")}
         positive["n_random + n_prior + initial"] = self.n_random + self.n_prior + len(self.initial)
         for name, number in positive.items():
             if number is not None and number < 1:
                 raise ValueError(f"{name} must be at least 1, not {number}")
-        shares = {name: getattr(self, name) for name in ("random", "replacement", "crossover", "horizon_change")}
         for name, number in {**shares, "n_random": self.n_random, "n_prior": self.n_prior, "seed": self.seed}.items():
             if number is not None and not number >= 0:
                 raise ValueError(f"{name} must not be negative, not {number}")
@@ -214,7 +197,9 @@ class AuxLossSampler(BaseSampler):
 
     def _study_seed(self, study: Study) -> int:
         """The seed of a study. One that was started with other settings is refused: its slots mean something else."""
-        settings = json.loads(json.dumps({name: getattr(self, name) for name in SETTINGS}, default=str))
+        # Without n_generations: a search may be continued.
+        names = [field.name for field in fields(self) if field.name not in ("seed", "n_generations")]
+        settings = json.loads(json.dumps({name: getattr(self, name) for name in names}, default=str))
         stored = study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY)
         if stored is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0]) if self.seed is None else self.seed

@@ -1,7 +1,7 @@
 """The search space: AuxLoss to and from Optuna parameters, and losses drawn at random and from the paper's priors."""
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from optuna.trial import FrozenTrial
 from sb3_aarl.aux_loss import LONGEST_HORIZON, OPERATORS, AuxLoss, Token
 
 MAX_HORIZON = 10  # paper, section 2.1
-Bits = tuple[bool, ...]
 
 
 def is_valid(source: Sequence[bool] | np.ndarray, target: Sequence[bool] | np.ndarray) -> bool:
@@ -138,15 +137,18 @@ def random_operator(rng: np.random.Generator, operators: Sequence[str] | None) -
     return operators[int(rng.integers(len(operators)))], bool(rng.integers(2))
 
 
-def _draw(
+def random_loss(
     rng: np.random.Generator,
-    max_horizon: int,
-    operators: Sequence[str] | None,
+    max_horizon: int = MAX_HORIZON,
+    operators: Sequence[str] | None = None,
     source: Sequence[float] = (0.5, 0.5, 0.5),
     target: Sequence[float] = (0.5, 0.5, 0.5),
     flips_states: bool = False,
 ) -> AuxLoss:
-    """A loss whose states, actions and rewards are in source and target with given probabilities, invalid ones redrawn."""
+    """
+    A loss whose horizon is uniform, and whose states, actions and rewards are in source and target with given probabilities
+    (paper, A.3), invalid ones redrawn. ``flips_states``: states of the target are those that are not in the source.
+    """
     # The horizon is drawn once: redrawing it with rejected masks would favour long ones.
     horizon = int(rng.integers(1, max_horizon + 1))
     chances = np.array([np.resize(kinds, 3 * horizon + 1) for kinds in (source, target)])
@@ -159,31 +161,8 @@ def _draw(
             return AuxLoss(horizon, of_source, of_target, *random_operator(rng, operators))
 
 
-def random_loss(rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
-    """A loss whose horizon is uniform and whose bits are Bernoulli(0.5), invalid ones redrawn (paper, A.3)."""
-    return _draw(rng, max_horizon, operators)
-
-
-def forward_dynamics_prior(
-    rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None
-) -> AuxLoss:
-    """
-    A loss that resembles forward dynamics (paper, A.3): states of the source Bernoulli(0.2), its actions
-    Bernoulli(0.8), states of the target those that are not in the source, all other bits Bernoulli(0.5).
-
-    The paper prints "target" for the first of these; only with the source does its third rule make sense.
-    """
-    return _draw(rng, max_horizon, operators, source=(0.2, 0.8, 0.5), flips_states=True)
-
-
-def reward_prediction_prior(
-    rng: np.random.Generator, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None
-) -> AuxLoss:
-    """
-    A loss that resembles reward prediction (paper, A.3): rewards of the target Bernoulli(0.8), no states and actions
-    in the target, the source Bernoulli(0.5).
-    """
-    return _draw(rng, max_horizon, operators, target=(0.0, 0.0, 0.8))
-
-
+# Losses that resemble forward dynamics and reward prediction (paper, A.3). The paper prints "target" for the 0.2; only with
+# "source" does its third rule, states of the target are those that are not in the source, make sense.
+forward_dynamics_prior = partial(random_loss, source=(0.2, 0.8, 0.5), flips_states=True)
+reward_prediction_prior = partial(random_loss, target=(0.0, 0.0, 0.8))
 PRIORS = (forward_dynamics_prior, reward_prediction_prior)

@@ -17,11 +17,7 @@ BLAS = ThreadpoolController()
 def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
     """
     The bits of both masks of the canonical forms, the number of states, actions and rewards of each mask (so that tokens of
-    one kind share what they have in common), horizon, operator and negatives.
-
-    :param losses: The losses
-    :param max_horizon: Longest horizon of the space
-    :return: (n_losses, n_features) floats
+    one kind share what they have in common), horizon, operator and negatives: (n_losses, n_features) floats.
     """
     losses = [loss.canonical() for loss in losses]
     masks = np.zeros((len(losses), 2, 3 * max_horizon + 1))
@@ -39,8 +35,6 @@ class TokenModel:
     A Bayesian ridge regression depends on its data only through their number and their centred second moments. It is fitted to
     a square root of these, as many rows as there are features; the missing rows come in through its prior, as ``alpha_1``
     enters the noise precision exactly like half a row. Scores are standardised first, so that their unit does not matter.
-
-    :param max_horizon: Longest horizon of the space
     """
 
     def __init__(self, max_horizon: int):
@@ -55,12 +49,7 @@ class TokenModel:
         self.root = np.eye(n_features)
 
     def add(self, losses: Sequence[AuxLoss], values: Sequence[float]) -> None:
-        """
-        Add finished trials and fit again.
-
-        :param losses: Their losses
-        :param values: Their scores, higher is better; those that are not finite, or too large to be squared, are skipped
-        """
+        """Add finished trials and fit again; values (higher is better) that are not finite, or too large, are skipped."""
         finite = np.abs(values) < LARGEST
         if not finite.any():
             return
@@ -93,18 +82,9 @@ class TokenModel:
         self.root = np.linalg.inv(np.linalg.cholesky(precision)).T
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """
-        One draw of the weights from the posterior.
-
-        :param rng: Source of randomness
-        :return: (n_features,)
-        """
+        """One draw of the weights from the posterior."""
         return self.mean + self.root @ rng.standard_normal(len(self.mean))
 
     def best(self, losses: Sequence[AuxLoss], weights: np.ndarray) -> int:
-        """
-        :param losses: Losses to choose from
-        :param weights: A draw of :meth:`draw`
-        :return: Index of the one that the weights rate highest
-        """
+        """Index of the loss that the weights of :meth:`draw` rate highest."""
         return int(np.argmax(features(losses, self.max_horizon) @ weights))

@@ -49,13 +49,7 @@ class SearchProgress(NamedTuple):
 
 @dataclass
 class RunningTrial:
-    """
-    A trial whose runs are at the executor.
-
-    :param trial: The trial
-    :param submissions: One run for each seed
-    :param n_reported: Evaluations that were reported to Optuna
-    """
+    """A trial whose runs, one for each seed, are at the executor, and how many evaluations were reported to Optuna."""
 
     trial: optuna.Trial
     submissions: list[Submission]
@@ -71,6 +65,7 @@ class RunningTrial:
             submission.stop()
 
 
+@dataclass(eq=False)
 class Driver:
     """
     One search: iterate over it to run it. Leaving the loop marks the trials that run as interrupted.
@@ -85,28 +80,19 @@ class Driver:
     :param on_change: Called with a trial when it starts, when it is reported, and before it is told
     """
 
-    def __init__(
-        self,
-        study: optuna.Study,
-        storage: BaseStorage,
-        make_runs: Callable[[AuxLoss], Sequence[Run]],
-        executor: Executor,
-        folder: Path,
-        workers: int = 1,
-        retries: int = 3,
-        on_change: Callable[[optuna.Trial], None] = lambda trial: None,
-    ):
-        if not isinstance(study.sampler, AuxLossSampler):
-            raise TypeError(f"a search needs an AuxLossSampler, not {type(study.sampler).__name__}")
-        self.study = study
-        self.storage = storage
-        self.sampler = study.sampler
-        self.make_runs = make_runs
-        self.executor = executor
-        self.folder = folder
-        self.workers = workers
-        self.retries = retries
-        self.on_change = on_change
+    study: optuna.Study
+    storage: BaseStorage
+    make_runs: Callable[[AuxLoss], Sequence[Run]]
+    executor: Executor
+    folder: Path
+    workers: int = 1
+    retries: int = 3
+    on_change: Callable[[optuna.Trial], None] = lambda trial: None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.study.sampler, AuxLossSampler):
+            raise TypeError(f"a search needs an AuxLossSampler, not {type(self.study.sampler).__name__}")
+        self.sampler = self.study.sampler
         self.running: dict[int, RunningTrial] = {}
         self.n_failures = 0
         # A database that is away for a while fails any of the calls; all may be repeated.
@@ -256,12 +242,7 @@ def search_progress(study: optuna.Study, sampler: AuxLossSampler) -> SearchProgr
 
 
 def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:
-    """
-    Where a candidate's runs are: named after generation, slot and attempt, so that the next trial of a slot finds them.
-
-    :param folder: Folder of the search
-    :param trial: The trial
-    """
+    """A candidate's folder, named after generation, slot and attempt, so that the next trial of a slot finds its runs."""
     at = trial.user_attrs
     if "slot" not in at:  # of a study.optimize of the user's own with more processes than slots
         return folder / "candidates" / f"trial-{trial.number}"
@@ -269,9 +250,5 @@ def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:
 
 
 def score(curves: Sequence[Sequence[Evaluation]]) -> float:
-    """
-    The score of a candidate: its mean area under the learning curve over the seeds.
-
-    :param curves: One for each seed
-    """
+    """The score of a candidate: its mean area under the learning curve over the seeds."""
     return float(np.mean([aulc(curve) for curve in curves]))

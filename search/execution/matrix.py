@@ -6,7 +6,6 @@ import re
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,19 +15,13 @@ from sb3_aarl.callbacks import aulc, replace_text
 from sb3_aarl.envs import PREFIX
 from search.execution.runs import Executor, Submission
 from search.training.provenance import ABOUT, read_about, write_about
-from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run, read_outcome
+from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run
 
 POLL_SECONDS = 0.5
 
 
 class Cell(NamedTuple):
-    """
-    One run of a matrix.
-
-    :param variant: Name of what is trained
-    :param environment: Id of the environment
-    :param seed: Seed of the run
-    """
+    """One run of a matrix: the name of what is trained, the id of its environment, and its seed."""
 
     variant: str
     environment: str
@@ -38,12 +31,8 @@ class Cell(NamedTuple):
 @dataclass(frozen=True)
 class Matrix:
     """
-    Runs by variant, environment and seed.
-
-    :param name: What a progress bar calls it
-    :param folder: Its folder
-    :param runs: The runs, in the order in which they are started
-    :param abouts: What ``provenance.json`` says of a run beside its own values
+    Runs by variant, environment and seed, in the order in which they are started; ``abouts`` is what ``provenance.json`` says
+    of a run beside its own values.
     """
 
     name: str
@@ -53,12 +42,7 @@ class Matrix:
 
 
 class MatrixProgress(NamedTuple):
-    """
-    :param total: Number of runs
-    :param finished: Those that are finished
-    :param failed: Those that were given up
-    :param seconds_to_go: Estimated seconds until all are over, None while that is not known
-    """
+    """How many runs there are, are finished, were given up; estimated seconds until all are over, None while not known."""
 
     total: int
     finished: int
@@ -66,33 +50,13 @@ class MatrixProgress(NamedTuple):
     seconds_to_go: float | None
 
 
-def all_cells(variants: Iterable[str], environments: Iterable[str], seeds: Iterable[int]) -> list[Cell]:
-    """
-    All runs of a comparison, seed by seed, so that a first one of each is there early.
-
-    :param variants: Names of what is trained
-    :param environments: Ids of the environments
-    :param seeds: Seeds of the runs on each
-    """
-    return [Cell(variant, environment, seed) for seed, environment, variant in product(seeds, environments, variants)]
-
-
 def task_name(environment: str) -> str:
-    """
-    The short form of a DeepMind Control task's id; other ids as they are.
-
-    :param environment: Id of the environment
-    """
+    """The short form of a DeepMind Control task's id; other ids as they are."""
     return environment.removeprefix(PREFIX).removesuffix("-v0") if environment.startswith(PREFIX) else environment
 
 
 def cell_folder(folder: Path, cell: Cell) -> Path:
-    """
-    Where a run is: ``FOLDER/VARIANT/TASK/seed-N``.
-
-    :param folder: Folder of the matrix
-    :param cell: The run
-    """
+    """Where a run is: ``FOLDER/VARIANT/TASK/seed-N``."""
     variant = cell.variant
     if not re.fullmatch(r"[\w.-]{1,80}", variant):  # such as a loss's notation
         slug = re.sub(r"[^a-z0-9]+", "-", variant.lower()).strip("-")[:60]
@@ -145,18 +109,12 @@ def scores(matrix: Matrix) -> pd.DataFrame:
     """
     The finished runs: one row each with ``variant``, ``environment``, ``seed``, ``score`` (AULC) and ``last`` (mean return at
     the last checkpoint).
-
-    :param matrix: The runs
     """
     return _scores((cell, cell_folder(matrix.folder, cell)) for cell in matrix.runs)
 
 
 def stored_scores(folder: Path) -> pd.DataFrame:
-    """
-    The same of all runs in the folder of a matrix, read without its configuration; none if the folder is not there.
-
-    :param folder: Folder of the matrix
-    """
+    """The same of all runs in the folder of a matrix, read without its configuration; none if the folder is not there."""
     abouts = {file.parent: read_about(file.parent) for file in sorted(folder.glob(f"*/*/*/{ABOUT}"))}
     return _scores((Cell(*(about[name] for name in Cell._fields)), path) for path, about in abouts.items())
 
@@ -167,26 +125,10 @@ def _scores(runs: Iterable[tuple[Cell, Path]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*Cell._fields, "score", "last"])
 
 
-def failures(matrix: Matrix) -> dict[Cell, str]:
-    """
-    The runs that failed, with the reasons.
-
-    :param matrix: The runs
-    """
-    found = {}
-    for cell in matrix.runs:
-        outcome = read_outcome(cell_folder(matrix.folder, cell))
-        if outcome is not None and outcome.failure is not None:
-            found[cell] = outcome.failure
-    return found
-
-
 def comparable(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The runs of the variants that have each environment and seed which any variant has. The others cannot be ranked: what
     they lack may be what is hard.
-
-    :param runs: As returned by :func:`scores`
     """
     n_pairs = len(runs[["environment", "seed"]].drop_duplicates())
     return runs[runs.groupby("variant")["variant"].transform("size") == n_pairs]

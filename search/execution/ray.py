@@ -26,11 +26,7 @@ class RayExecutor:
         self._references: list[Any] = []
 
     def submit(self, fn: Callable[..., Any], /, *args: Any) -> Any:
-        """
-        :param fn: The function
-        :param args: Its arguments
-        :return: A future of ``concurrent.futures``
-        """
+        """Submit a function, and return a future of ``concurrent.futures``."""
         reference = ray.remote(**self._options)(fn).remote(*args)
         self._references.append(reference)
         return reference.future()

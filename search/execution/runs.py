@@ -85,10 +85,8 @@ def _train(folder: Path) -> int:
 
 def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
     """
-    The learning curve over several seeds.
-
-    :param curves: One for each seed, with equally many episodes; the shortest decides the length
-    :return: [environment steps, mean, standard deviation] over the episodes of all seeds, for every evaluation
+    The learning curve over several seeds with equally many episodes, as long as the shortest: environment steps, mean and
+    standard deviation over the episodes of all seeds, for every evaluation.
     """
     points = []
     for evaluations in zip(*curves, strict=False):
@@ -100,11 +98,7 @@ def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
 
 
 class LocalExecutor(ThreadPoolExecutor):
-    """
-    Processes of this machine: each thread starts one and waits for it. Leaving the ``with`` block ends those that run.
-
-    :param workers: How many run at the same time
-    """
+    """Processes of this machine: each thread starts one and waits for it. Leaving the ``with`` block ends those that run."""
 
     def __init__(self, workers: int = 1):
         super().__init__(workers, thread_name_prefix="run", initializer=self._own_thread)
@@ -122,14 +116,7 @@ class LocalExecutor(ThreadPoolExecutor):
 
 
 class Submission:
-    """
-    One run at an executor; resubmitted while its process is killed, or something else fails that is not the run's fault.
-
-    :param executor: The executor
-    :param folder: Folder of the run
-    :param run: The run
-    :param retries: How often it is resubmitted
-    """
+    """One run at an executor; resubmitted while its process is killed, or something fails that is not the run's fault."""
 
     def __init__(self, executor: Executor, folder: Path, run: Run, retries: int):
         self.executor = executor

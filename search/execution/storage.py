@@ -38,8 +38,6 @@ def load_study(storage: RDBStorage, name: str | None = None) -> optuna.Study:
     """
     Load a study.
 
-    :param storage: Its storage
-    :param name: Its name, None for the only one there
     :raises ValueError: naming the studies that are there, when it is not one of them
     """
     names = optuna.get_all_study_names(storage)

@@ -16,7 +16,7 @@ from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from search.evolution.space import loss_of, loss_to_params
 from search.results.rankings import rank_agreement, rankings
-from search.results.trials import curve_of, lineage, ranked, score_of, seconds_of
+from search.results.trials import curve_of, lineage, ranked, score_of
 
 # Section 3.3, in the order of table 5.
 PATTERNS: Mapping[str, str | AuxLoss] = {
@@ -28,22 +28,9 @@ PATTERNS: Mapping[str, str | AuxLoss] = {
 }
 # The other columns of table 5, one for each kind of token: n_target - n_source.
 COUNTS = tuple(f"{name}, n_target > n_source" for name in ("State", "Action", "Reward"))
-# Formats of the columns of a summary's tables, and their headings where these are not their names; numbers that are not here
-# are integers.
-FORMATS = {
-    **dict.fromkeys(("difference", "gain"), "+.2f"),
-    **dict.fromkeys(("score", "mean", "std", "median", "mean_with", "mean_without", "spearman", "kendall"), ".2f"),
-    **dict.fromkeys(("hours", "core_hours"), ".2f"),
-    **{
-        "welch_p": ".2g",
-        "importance": ".3f",
-        "distinct": ".0%",
-        "hamming": ".1f",
-        "average": ".2f",
-        "lowest": ".2f",
-        "highest": ".2f",
-    },
-}
+# Formats of the columns of a summary's tables where these are not integers or .2f, and their headings where these are not
+# their names.
+FORMATS = {"difference": "+.2f", "gain": "+.2f", "welch_p": ".2g", "importance": ".3f", "distinct": ".0%", "hamming": ".1f"}
 HEADINGS = {
     **{"n": "Losses", "std": "Deviation", "hamming": "Hamming distance", "index": "", "number": "Trial"},
     **{"device": "Trained on", "average": "Mean", "welch_p": "Welch p"},
@@ -124,8 +111,6 @@ def table5_classes(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = 
     Section 3.3 compares losses with n_target > n_source to "the other way around", which it writes n_target < n_source. So
     a loss with n_target = n_source is in neither class.
 
-    :param table: As returned by :func:`trial_table`
-    :param patterns: Name and pattern of each column: an AuxLoss, its notation, or its name in the catalogue
     :return: One row an analysed trial, one column a pattern, then ``COUNTS``
     :raises ValueError: for a pattern that cannot be read
     """
@@ -148,8 +133,6 @@ def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS
     each other, and later generations score higher and have other patterns. So p-values are lower than those of an
     experiment, and they are not corrected for the number of tests.
 
-    :param table: As returned by :func:`trial_table`
-    :param patterns: As in :func:`table5_classes`
     :return: One row a pattern, then ``COUNTS``: ``difference`` of the mean scores (with - without), ``welch_p`` of Welch's
         two-sided t-test (NaN where a class is too small), ``mean_with``, ``mean_without``, ``n_with``, ``n_without``,
         ``n_neither``
@@ -181,8 +164,6 @@ def table5_layout(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """
     Table 5 as the paper prints it: one row a study, differences with * where Welch's p < 0.05 and ** where p < 0.01 (the
     paper only says "t-test"), a dash where a class is empty.
-
-    :param tables: Results of :func:`table5` by the names of the studies
     """
 
     def cell(row: pd.Series) -> str:
@@ -262,7 +243,6 @@ def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = St
     """
     The best trial and all its ancestors, the latest first; empty if no trial has a score.
 
-    :param trials: All trials of the study, in the order of numbers
     :return: By ``number``: ``generation``, ``operation``, ``parents``, ``score``, ``gain`` (the score less that of the best
         parent, NaN without parents) and the notation of the ``loss``
     """
@@ -280,17 +260,15 @@ def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
     Where the trials were trained, and how long it took.
 
-    :return: One row a device and commit, as noted by the driver: finished ``trials``, failed ones included, but not those
-        that were interrupted; their ``hours``, one run after the other; ``core_hours`` (hours x threads; NaN for GPUs and
-        where nothing is noted)
+    :return: One row a device and commit, as noted by the driver: ``trials`` whose seconds it noted, failed ones included, but
+        not those that were interrupted; their ``hours``, one run after the other; ``core_hours`` (hours x threads; NaN for
+        GPUs and where nothing is noted)
     """
     rows = []
-    for trial in trials:
-        seconds, attributes = seconds_of(trial), trial.user_attrs
-        if seconds is not None:
-            device, commit = (str(attributes.get(key, "not noted")) for key in ("device", "commit"))
-            threads = attributes.get("threads", 1) if device.startswith("CPU") else np.nan
-            rows.append((device, commit, seconds / 3600, seconds / 3600 * threads))
+    for attributes in (trial.user_attrs for trial in trials if "seconds" in trial.user_attrs):
+        hours = attributes["seconds"] / 3600
+        device, commit = (str(attributes.get(key, "not noted")) for key in ("device", "commit"))
+        rows.append((device, commit, hours, hours * attributes.get("threads", 1) if device.startswith("CPU") else np.nan))
     table = pd.DataFrame(rows, columns=["device", "commit", "hours", "core_hours"])
     groups = table.groupby(["device", "commit"], sort=False)
     # min_count: the sum of nothing but NaN is NaN.
@@ -311,14 +289,7 @@ def summary(
     patterns: Mapping[str, str | AuxLoss] = PATTERNS,
     top: int = 10,
 ) -> Summary:
-    """
-    Everything above for one study; ``operator`` only if it was searched, the losses of ``lineage`` as their notation.
-
-    :param trials: All trials of the study, in the order of numbers
-    :param direction: The study's
-    :param patterns: As in :func:`table5_classes`
-    :param top: As in :func:`rank_agreement`
-    """
+    """Everything above for one study; ``operator`` only if it was searched, the losses of ``lineage`` as their notation."""
     table = trial_table(trials)
     operator = ["operator", "negatives"]
     tables = {
@@ -354,7 +325,7 @@ def readable(name: str, table: pd.DataFrame) -> pd.DataFrame:
             return "–"
         if isinstance(value, bool):
             return "yes" if value else "no"
-        return format(value, FORMATS.get(column, "" if isinstance(value, str) else "d"))
+        return format(value, FORMATS.get(column, ".2f" if isinstance(value, float) else ""))
 
     flat = table.reset_index()
     text = pd.DataFrame({column: [cell(column, value) for value in flat[column].tolist()] for column in flat}, dtype=object)

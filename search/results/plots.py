@@ -42,13 +42,7 @@ def evolution_figure(
     baselines: Iterable[tuple[str, float]] = (),
     direction: StudyDirection = StudyDirection.MAXIMIZE,
 ) -> go.Figure:
-    """
-    The score of every completed candidate by generation (the paper's figures 4 and 6), with mean and best of the generations.
-
-    :param table: Trials of a study, as returned by ``analysis.trial_table``; those without a score are skipped
-    :param baselines: Names and scores of horizontal lines
-    :param direction: The study's, for what is best
-    """
+    """The score of every completed candidate by generation (the paper's figures 4 and 6), with their mean and best."""
     scored = table[table["score"].notna()]
     notations = ["<br>".join(textwrap.wrap(escape(str(loss)), 80)) if loss else "no loss" for loss in scored["loss"]]
     # Plain lists, not arrays: plotly.py writes arrays in a form that the dashboard's older plotly.js cannot read.
@@ -118,16 +112,10 @@ def evolution_plot(
     baselines: Mapping[str, Iterable[tuple[str, float]]] | None = None,
     direction: StudyDirection = StudyDirection.MAXIMIZE,
 ) -> Figure:
-    """
-    The score of every candidate by generation, beside baselines: the paper's figures 4 and 6, one panel a study.
-
-    :param tables: Title and trials of each study, as returned by ``analysis.trial_table``
-    :param baselines: Names and scores of each study's baselines, under the study's title
-    :param direction: The studies', for what is best
-    """
+    """The score of every candidate by generation, beside baselines: the paper's figures 4 and 6, one panel a study."""
     baselines = {title: list(lines) for title, lines in (baselines or {}).items()}
     names = list(dict.fromkeys(name for lines in baselines.values() for name, _ in lines))
-    figure, panels = _panels(list(tables), columns=3, width=4.4, height=3.6)
+    figure, panels = _panels(list(tables), SCORE, columns=3, width=4.4, height=3.6)
     for axes, (title, table) in zip(panels, tables.items(), strict=True):
         trials = analysis.analysed(table)
         axes.plot(_spread(trials), trials["score"], "o", mfc="white", mec="#888888", ms=4, mew=0.7, label="candidate")
@@ -141,7 +129,6 @@ def evolution_plot(
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_xlabel("Generation")
         axes.set_title(f"{title}\n{textwrap.fill(_counts(table), 60)}", fontsize=9)
-    _label_rows(panels, SCORE)
     _legend(figure, panels)
     return figure
 
@@ -150,16 +137,13 @@ def histogram_plot(tables: Mapping[str, pd.DataFrame]) -> Figure:
     """
     How the scores of up to three studies are distributed: the paper's figure 7, evolution with and without pruning of the
     search space.
-
-    :param tables: Name and trials of each study, as returned by ``analysis.trial_table``
     """
     if len(tables) > len(HISTOGRAMS):
         raise ValueError(f"a histogram shows at most {len(HISTOGRAMS)} studies, not {len(tables)}: {', '.join(tables)}")
-    figure, (axes,) = _panels([""], columns=1, width=6.4, height=3.8)
+    figure, (axes,) = _panels([""], "Share of the candidates (%)", columns=1, width=6.4, height=3.8)
     _histograms(axes, {name: analysis.analysed(table)["score"] for name, table in tables.items()}, 25)
     axes.set_title(_counts_each(tables), fontsize=9)
     axes.set_xlabel(SCORE)
-    axes.set_ylabel("Share of the candidates (%)")
     _legend(figure, [axes])
     return figure
 
@@ -171,15 +155,12 @@ def patterns_plot(
     """
     Scores of the candidates with and without each pattern of table 5: the paper's figure 11. One column of panels a study;
     a single study's patterns stand beside each other. Each class is a population of its own: its bars sum to 100 %.
-
-    :param tables: Title and trials of each study, as returned by ``analysis.trial_table``
-    :param patterns: As in ``analysis.table5``
     """
     names = [*patterns, *analysis.COUNTS]
     single = len(tables) == 1
     titles = names if single else [f"{name}\n{title}" for name in names for title in tables]
     figure_columns = 4 if single else len(tables)
-    figure, panels = _panels(titles, figure_columns, width=3.1, height=2.3)
+    figure, panels = _panels(titles, "Share of the class (%)", figure_columns, width=3.1, height=2.3)
     for column, table in enumerate(tables.values()):
         scores = analysis.analysed(table)["score"]
         classes = analysis.table5_classes(table, patterns)
@@ -192,26 +173,19 @@ def patterns_plot(
             axes.set_title(f"{titles[row * len(tables) + column]}\n{counts}", fontsize=8)
     for axes in panels[-figure_columns:]:
         axes.set_xlabel(SCORE, fontsize=9)
-    _label_rows(panels, "Share of the class (%)")
     figure.suptitle(_counts_each(tables), fontsize=10)
     _legend(figure, panels)
     return figure
 
 
 def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
-    """
-    Learning curves of the best candidates under three metrics (AULC, first and last checkpoint): the paper's figure 10.
-
-    :param table: Trials of a study, as returned by ``analysis.trial_table``
-    :param top: Number of candidates in each panel
-    :raises ValueError: as :func:`rankings` does
-    """
+    """Learning curves of the best candidates under three metrics (AULC, first and last checkpoint): the paper's figure 10."""
     ranking = rankings(analysis.analysed(table))
     agreement = rank_agreement(ranking, top)
     steps = [point[0] for point in ranking["curve"].iloc[0]]
     first, last = (EngFormatter(sep="")(step) for step in (steps[0], steps[-1]))
     names = {"aulc": "AULC", "first": f"the return at {first} steps", "last": f"the return at {last} steps"}
-    figure, panels = _panels(list(names.values()), columns=3, width=4.2, height=3.6)
+    figure, panels = _panels(list(names.values()), "Mean return", columns=3, width=4.2, height=3.6)
     by_aulc = set(leading(ranking, "aulc", top)["number"])
     looks = {True: ("-", "#8c8c8c", f"in the top {top} by AULC"), False: (":", "black", "not in it")}
     for axes in panels[1:]:
@@ -229,28 +203,20 @@ def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
             title += f"\nrank correlation with AULC {spearman:.2f} (Spearman)"
         axes.set_title(title, fontsize=9)
         _step_axis(axes)
-    _label_rows(panels, "Mean return")
     figure.suptitle(_counts(table), fontsize=10)
     _legend(figure, panels)
     return figure
 
 
-def learning_curves_plot(curves: pd.DataFrame, smooth: int = 1) -> Figure:
+def learning_curves_plot(curves: pd.DataFrame) -> Figure:
     """
     Learning curves with their deviation over seeds, one panel a task: the paper's figure 9.
 
     A point is drawn where all seeds of its variant and task have one. The shade is the standard deviation over the seeds;
     where there is one seed only, over its episodes.
-
-    :param curves: As returned by ``search.studies.benchmark.read_curves``
-    :param smooth: Evaluations over which each run is averaged, centred; the paper smooths too and does not say how much
     """
     tasks, variants = list(curves["env"].unique()), list(curves["variant"].unique())
-    curves = curves.sort_values("environment_steps")
-    if smooth > 1:
-        runs = curves.groupby(["variant", "env", "seed"])[["mean", "std"]]
-        curves[["mean", "std"]] = runs.transform(lambda run: run.rolling(smooth, center=True, min_periods=1).mean())
-    figure, panels = _panels(tasks, columns=4, width=3.3, height=2.7)
+    figure, panels = _panels(tasks, "Return (mean ± std)", columns=4, width=3.3, height=2.7)
     for axes, task in zip(panels, tasks, strict=True):
         for position, variant in enumerate(variants):
             runs = curves[(curves["env"] == task) & (curves["variant"] == variant)]
@@ -268,13 +234,12 @@ def learning_curves_plot(curves: pd.DataFrame, smooth: int = 1) -> Figure:
                 axes.fill_between(points.index, low, high, color=colour, alpha=0.18, linewidth=0)
         axes.set_title(f"{task}\n{_seeds(curves[curves['env'] == task])}", fontsize=9)
         _step_axis(axes)
-    _label_rows(panels, "Return (mean ± std)")
     _legend(figure, panels)
     return figure
 
 
-def _panels(titles: Sequence[str], columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel for each title; width and height of a panel in inches."""
+def _panels(titles: Sequence[str], label: str, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel for each title, their vertical axis labelled once a row; width and height of a panel in inches."""
     columns = max(1, min(columns, len(titles)))
     rows = max(1, -(-len(titles) // columns))
     # Without pyplot, whose figures are global.
@@ -289,15 +254,9 @@ def _panels(titles: Sequence[str], columns: int, width: float, height: float) ->
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
+    for axes in panels[::columns]:
+        axes.set_ylabel(label, fontsize=9)
     return figure, panels
-
-
-def _label_rows(panels: Sequence[Axes], label: str) -> None:
-    """The label of the vertical axes, once a row."""
-    for axes in panels:
-        spec = axes.get_subplotspec()
-        if spec is not None and spec.is_first_col():
-            axes.set_ylabel(label, fontsize=9)
 
 
 def _legend(figure: Figure, panels: Iterable[Axes]) -> None:

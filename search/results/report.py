@@ -1,9 +1,11 @@
 """One HTML file on what a search found: self-contained, and readable without JavaScript but for its plots to click."""
 
 import io
+import re
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +17,14 @@ from matplotlib.figure import Figure
 from optuna import Study
 from optuna.trial import FrozenTrial
 from plotly.io import to_html
-from rich.table import Table
-from rich.text import Text
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
 from search.execution.matrix import comparable, stored_scores, task_name
 from search.results import analysis
-from search.results import table as tables
-from search.results.notation import mathml
-from search.results.plots import evolution_figure, learning_curves_plot, patterns_plot, rankings_plot
+from search.results.plots import evolution_figure, patterns_plot, rankings_plot
 from search.results.trials import lineage, ranked
 from search.studies import cross_validation
-from search.studies.benchmark import read_curves
 from search.studies.search import SETTINGS_KEY
 from search.training.provenance import provenance
 
@@ -58,17 +55,8 @@ def write_report(
     path: str | Path,
     baselines: Iterable[tuple[str, float]] = (),
     validation: pd.DataFrame | None = None,
-    benchmark: Path | None = None,
 ) -> None:
-    """
-    Write the report of a study, finished or not.
-
-    :param study: The study
-    :param path: Where the HTML file goes; its folder is made if it is not there
-    :param baselines: Names and scores to compare with
-    :param validation: Runs of the cross-validation, as returned by :func:`search.execution.matrix.stored_scores`
-    :param benchmark: Folder of a benchmark whose tables and learning curves are shown too
-    """
+    """Write the report of a study, finished or not, with baselines and the runs of its cross-validation as one HTML file."""
     trials = study.get_trials(deepcopy=False)
     table = analysis.trial_table(trials)
     best = ranked(trials, study.direction)
@@ -92,7 +80,6 @@ def write_report(
         lineage=_candidates(sorted(lineage(best[0], trials), key=lambda trial: -trial.number)) if best else None,
         validation=_validation(validation),
         taught=_taught(study, table),
-        benchmark=None if benchmark is None else _benchmark(benchmark),
         machines=analysis.readable("machines", machines),
         started=min(started, default=""),
         ended=max(ended, default=""),
@@ -108,6 +95,16 @@ def _candidates(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     text = analysis.readable("candidates", table.set_index("number")[["score", "generation", "operation", "parents"]])
     text.insert(0, "Loss", [_typeset(loss) for loss in table["loss"]])
     return text
+
+
+def mathml(loss: AuxLoss) -> str:
+    """The loss as the paper prints it, for HTML: one ``math`` element a token, as browsers break no line inside of one."""
+
+    def token(match: re.Match[str]) -> str:
+        offset = f"<mo>+</mo><mn>{match[2]}</mn>" if match[2] else ""
+        return f"<math><msub><mi>{match[1]}</mi><mrow><mi>t</mi>{offset}</mrow></msub></math>"
+
+    return re.sub(r"\b([sar])_t(?:\+(\d+))?", token, escape(str(loss).replace("->", "→")))
 
 
 def _typeset(loss: AuxLoss | None) -> Markup:
@@ -142,25 +139,6 @@ def _taught(study: Study, table: pd.DataFrame) -> dict[str, Any] | None:
         "patterns": _picture(patterns_plot({study.study_name: table})),
         "rankings": None if "rank_agreement" in summary.problems else _picture(rankings_plot(table)),
     }
-
-
-def _benchmark(folder: Path) -> dict[str, Any]:
-    """The tables of a benchmark and its learning curves."""
-    found = tables.read_tables(folder)
-    return {
-        "folder": folder,
-        "tables": [(str(table.title), _frame(table)) for table in tables.terminal_tables(found)],
-        "footnotes": tables.footnotes(found),
-        "missing": tables.missing(found.runs) + tables.mixed(found.runs),
-        "curves": _picture(learning_curves_plot(read_curves(folder))),
-    }
-
-
-def _frame(table: Table) -> pd.DataFrame:
-    """A table of the terminal, for the page."""
-    columns = [[Text.from_markup(str(cell)).plain for cell in column.cells] for column in table.columns]
-    headings = [Text.from_markup(str(column.header)).plain for column in table.columns]
-    return pd.DataFrame(zip(*columns, strict=True), columns=headings)
 
 
 def _picture(figure: Figure) -> str:

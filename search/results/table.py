@@ -73,7 +73,6 @@ def read_runs(folder: Path) -> pd.DataFrame:
     ``commit`` and ``versions`` (of all sessions that trained it), ``program`` and ``episodes`` (of an evaluation); empty or
     0 where that is not known.
 
-    :param folder: Folder of a benchmark; runs that were copied there from another machine count too
     :raises ValueError: when there are none, and as :func:`search.studies.benchmark.read_abouts` does
     """
     rows: list[tuple[Any, ...]] = []
@@ -125,7 +124,6 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     variants that are complete: if these are not the paper's four, no number of the paper stands beside them. N is 5 seeds x
     6 environments there, so both deviations contain the difference of the environments: the test is a cautious one.
 
-    :param runs: As returned by :func:`read_runs`
     :param number: 3, 4 or 6, None for no table of the paper
     :return: One row for each ``checkpoint``, ``environment`` and ``variant``, in their order: ``planned`` and ``runs`` (how
         many were planned, and are finished), ``mean``, ``std``, ``column`` (the paper's heading), ``paper_mean``,

@@ -21,18 +21,6 @@ def score_of(trial: FrozenTrial) -> float | None:
     return trial.value if finished else None
 
 
-def seconds_of(trial: FrozenTrial) -> float | None:
-    """
-    How long a finished trial was trained: the seconds noted by the driver, else from its start to its end; None where neither
-    is known, as an interrupted trial ends when its search is resumed.
-    """
-    if not trial.state.is_finished() or trial.user_attrs.get("interrupted"):
-        return None
-    if "seconds" in trial.user_attrs:
-        return trial.user_attrs["seconds"]
-    return None if trial.duration is None else trial.duration.total_seconds()
-
-
 def ranked(trials: Iterable[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> list[FrozenTrial]:
     """The trials that have a score, the best first."""
     sign = -1 if direction == StudyDirection.MAXIMIZE else 1

@@ -4,6 +4,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pandas as pd
 
 from sb3_aarl import catalog
 from sb3_aarl.envs import PREFIX
-from search.execution.matrix import Cell, Matrix, all_cells, task_name
+from search.execution.matrix import Cell, Matrix, task_name
 from search.training.config import ConfigError, action_repeat, load_hyperparameters, read_yaml, resolve_env_id
 from search.training.provenance import ABOUT, read_about
 from search.training.run import FREE, Run, check_run, checkpoint_interval, differences, partial_curve
@@ -34,15 +35,10 @@ def load_benchmark(
     """
     Read the variants of a benchmark, and check all that can be checked without training.
 
-    :param files: Files of hyper-parameters, as ``load_hyperparameters`` reads them; the variants have their names
     :param environments: Ids or short forms; none for those that all files name
-    :param seeds: Seeds of the runs on each
     :param checkpoints: Environment steps of the comparison; none for those of 100k, 500k and 1000k that lie in
         every file's ``n_timesteps``
     :param every: Environment steps after which runs are also evaluated
-    :param evaluation_episodes: Episodes of each evaluation
-    :param threads: Threads of each run
-    :param folder: Folder of the benchmark, which may have runs of other variants, tasks and seeds
     :raises ValueError: naming what is wrong, or which setting differs from that of runs in the folder
     """
     for stem, count in Counter(path.stem for path in files).items():
@@ -58,7 +54,9 @@ def load_benchmark(
     paths = {path.stem: str(path) for path in files}
     runs: dict[Cell, Run] = {}
     abouts: dict[Cell, dict[str, Any]] = {}
-    for cell in all_cells(paths, ids, seeds):
+    # Seed by seed, so that a first run of each is there early.
+    for seed, environment, variant in product(seeds, ids, paths):
+        cell = Cell(variant, environment, seed)
         settings, steps = hyperparameters[cell[:2]], compared[cell.environment]
         evaluations = _evaluations(steps, every, checkpoint_interval(settings), cell)
         loss = settings["aux_loss"]
@@ -129,11 +127,7 @@ def read_curves(folder: Path) -> pd.DataFrame:
 
 
 def parse_steps(text: str) -> tuple[int, ...]:
-    """
-    Environment steps, such as ``100k,500k,1M`` or ``20000``.
-
-    :raises ValueError: naming what is no number of steps
-    """
+    """Environment steps, such as ``100k,500k,1M`` or ``20000``."""
     steps = []
     for part in text.split(","):
         match = re.fullmatch(r"([1-9]\d*)([km]?)", part.strip().lower())
@@ -144,11 +138,7 @@ def parse_steps(text: str) -> tuple[int, ...]:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """
-    Seeds, such as ``0-9`` or ``0,3,5-7``.
-
-    :raises ValueError: naming what is neither a number nor a range
-    """
+    """Seeds, such as ``0-9`` or ``0,3,5-7``."""
     seeds: list[int] = []
     for part in text.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())

@@ -33,14 +33,7 @@ def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
 
 
 def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, top: int | None = None) -> Matrix:
-    """
-    The runs of a cross-validation: candidates x environments x seeds.
-
-    :param config: The search, with a section ``cross_validation``
-    :param study: Its study
-    :param folder: Its folder; the runs are in its folder ``cross-validation``
-    :param top: How many candidates, None for the configuration's number
-    """
+    """The runs of a cross-validation: candidates x environments x seeds; ``top`` replaces the configuration's number."""
     section = config.cross_validation
     if section is None:
         raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
@@ -64,7 +57,6 @@ def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The candidates by their mean AULC over all environments (paper, A.4), the best first.
 
-    :param runs: As returned by :func:`search.execution.matrix.scores`
     :return: One row a candidate: mean score on each environment, then ``mean``, ``std`` (sample deviation
         over seeds of the mean over environments), and ``runs``
     """

@@ -34,12 +34,7 @@ class Objective:
         self.make_runs = runs_of(config)
 
     def __call__(self, trial: optuna.Trial) -> float:
-        """
-        Train the candidate of a trial.
-
-        :raises optuna.TrialPruned: for an invalid candidate, before anything is trained, and for a pruned one
-        :raises FloatingPointError: when its loss is not finite, or its Q values explode
-        """
+        """Train the candidate of a trial; TrialPruned is raised where it is not valid, too."""
         loss = suggest_aux_loss(trial, self.config.max_horizon, self.config.operators)
         trial.set_user_attr("loss", str(loss))
         trial.set_user_attr("canonical", str(loss.canonical()))

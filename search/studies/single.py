@@ -26,13 +26,13 @@ from search.training.run import (
     Run,
     check_run,
     checkpoint_interval,
-    is_finished,
     make_env,
     prepare_run,
     read_run,
     spread_checkpoints,
     train,
 )
+from search.training.shipped import find_file
 
 VIDEO_SIZE = 320  # pixels, height and width
 
@@ -40,7 +40,7 @@ VIDEO_SIZE = 320  # pixels, height and width
 def train_one(
     environment: str,
     aux_loss: str | None,
-    config: str | Path,
+    config: str | Path | None,
     environment_steps: int | None = None,
     n_evaluations: int = 5,
     evaluation_episodes: int = 10,
@@ -50,23 +50,22 @@ def train_one(
     progress_bar: bool = True,
     on_evaluation: Callable[[list[Evaluation]], bool | None] | None = None,
     imports: Sequence[str] = (),
-) -> tuple[list[Evaluation], Path, bool]:
+) -> tuple[list[Evaluation], Path]:
     """
     Train with one loss in this process, and keep model, learning curve and ``provenance.json``.
 
-    :param environment: Id of the environment, or the short form of a DeepMind Control task
     :param aux_loss: Notation, name, or YAML file of ``load_aux_loss``; ``"none"`` for none; None for what the file of
         hyper-parameters says, or ``"auto"``
-    :param config: File of hyper-parameters
+    :param config: File of hyper-parameters, or name of a shipped one; None for ``aarl_state`` or ``default``
     :param environment_steps: Environment steps of the run, None for the file's ``n_timesteps``
-    :param folder: Folder of the run, None for one in ``runs`` named after environment, loss and settings
-    :param on_evaluation: Called with the curve so far after each evaluation
-    :param imports: Modules that have been imported, and that a resumed run imports first
-    :return: The learning curve, the folder, and whether the run was finished before
+    :param imports: Modules that are imported first
+    :return: The learning curve and the folder
     :raises ValueError: when something is unknown or does not fit, or the folder has another run
     """
+    import_modules(imports)
     environment = resolve_env_id(environment)
-    hyperparameters = load_hyperparameters(config, environment)
+    file = find_file(Path(config or ("aarl_state" if environment.startswith(PREFIX) else "default")))
+    hyperparameters = load_hyperparameters(file, environment)
     from_file = hyperparameters.pop("aux_loss", "auto")
     loss = from_file if aux_loss is None else aux_loss
     if isinstance(loss, str) and Path(loss).suffix in (".yml", ".yaml"):
@@ -77,7 +76,7 @@ def train_one(
         loss = str(catalog.resolve(loss))
     if environment_steps is None:
         if "n_timesteps" not in hyperparameters:
-            raise ConfigError(f"how many steps? {config} has no n_timesteps for {environment}")
+            raise ConfigError(f"how many steps? {file} has no n_timesteps for {environment}")
         environment_steps = hyperparameters["n_timesteps"] * action_repeat(hyperparameters)
     run = Run(
         environment=environment,
@@ -97,20 +96,13 @@ def train_one(
     folder = Path(folder)
     check_run(run)
     prepare_run(folder, run)
-    was_finished = is_finished(folder)
-    return train(folder, progress_bar, on_evaluation), folder, was_finished
+    return train(folder, progress_bar, on_evaluation), folder
 
 
-def load_trained(
-    path: Path, environment: str | None = None, config: Path | None = None, renders: bool = False
-) -> tuple[SACAux, VecEnv]:
+def load_trained(path: Path, environment: str | None = None, renders: bool = False) -> tuple[SACAux, VecEnv]:
     """
     A trained model, and an environment for it: that of the run that it is from, or another one.
 
-    :param path: Folder of a run with its model, or the file of a model
-    :param environment: Id or short form; None for that of the run
-    :param config: File of hyper-parameters whose ``env_kwargs`` count; None for those of the run, if there is one
-    :param renders: Whether the environment renders
     :raises ValueError: when there is no model, or the environment is not known
     """
     folder = path if path.is_dir() else path.parent
@@ -123,7 +115,7 @@ def load_trained(
     if environment is None and run is None:
         raise ValueError(f"which environment? {folder} has no {RUN} that names it")
     env_id = resolve_env_id(environment) if environment is not None else run.environment  # type: ignore[union-attr]
-    settings = load_hyperparameters(config, env_id) if config is not None else run.hyperparameters if run is not None else {}
+    settings = run.hyperparameters if run else {}
     env_kwargs = settings.get("env_kwargs") or {}
     if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
         env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}

@@ -105,13 +105,8 @@ def remove(folder: Path) -> None:
 
 class CheckpointCallback(BaseCallback):
     """
-    After each evaluation, save the run when the rollout that was evaluated is stored and trained on, and restart it.
-
-    :param folder: Folder of the run
-    :param seed: Seed of the run
-    :param curve: The learning curve, extended by ``LearningCurveCallback``
-    :param on_save: Called after each checkpoint; training ends if it returns False
-    :param state: The checkpoint from which the run is resumed
+    After each evaluation, save the run when the rollout that was evaluated is stored and trained on, and restart it. Training
+    ends if ``on_save`` returns False; ``state`` is the checkpoint from which the run is resumed.
     """
 
     model: SACAux

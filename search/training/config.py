@@ -73,8 +73,6 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     Nothing in the file is evaluated. A learning rate may be ``lin_3e-4``, which falls to 0, and arguments may be text with
     plain values: ``"dict(net_arch=[64, 64])"``.
 
-    :param path: The YAML file
-    :param env_id: Id of the environment
     :raises ConfigError: naming the file and the key that is wrong
     """
     entries = read_yaml(path)
@@ -93,9 +91,6 @@ def check_hyperparameters(values: Mapping[str, Any], env_id: str, source: str) -
     """
     Hyper-parameters with the types of the arguments that they are: lists are tuples where an argument is one.
 
-    :param values: Plain values
-    :param env_id: Id of the environment
-    :param source: Where they are from, for messages
     :raises ConfigError: naming the source and the key that is wrong
     """
     refused = [f"{source}: {key}: {reason}" for key, reason in REFUSED.items() if key in values]
@@ -352,10 +347,8 @@ def _check_aux_loss(value: Any) -> Any:
 @functools.cache
 def _hyperparameters_model(is_dmc: bool, policy: str, encoder: str, has_arguments: bool) -> type[BaseModel]:
     """
-    The model of an environment's hyper-parameters: the arguments of SACAux, its policy and so on.
-
-    :param encoder: Name of the encoder; "None", or an unknown one, for the policy's own
-    :param has_arguments: Whether ``normalize`` is a mapping of arguments
+    The model of an environment's hyper-parameters: the arguments of SACAux, its policy and so on. For an encoder that is not
+    known, such as "None", they are those of the policy's own.
     """
     policy_class: Any = SACAux.policy_aliases.get(policy, SACAuxPolicy)
     extractor = encoder_class(encoder if encoder in ENCODERS else policy_class.default_encoder)

@@ -64,11 +64,7 @@ def versions() -> str:
 
 
 def hide_password(text: str) -> str:
-    """
-    A text that may hold the URL of a database, without its password.
-
-    :param text: Such as an error message
-    """
+    """A text that may hold the URL of a database, without its password."""
     return re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", text)
 
 
@@ -107,9 +103,3 @@ def add_session(path: Path, **session: Any) -> None:
     session = {**provenance(), **session}
     session["command"] = about.get("command", session["command"])
     write_about(path, {**about, "sessions": [*about.get("sessions", ()), session]})
-
-
-def save_result(path: Path, **result: Any) -> None:
-    """Write what was measured, plain values, to a file as JSON, with :func:`provenance` beside it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**provenance(), **result}, indent=1) + "\n")

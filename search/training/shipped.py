@@ -8,11 +8,7 @@ SEARCHES = ZOO / "search"
 
 
 def shipped_files(searches: bool) -> dict[str, Path]:
-    """
-    The shipped files by name, such as ``aarl_state`` or ``body/simba``.
-
-    :param searches: Whether to return configurations of searches, or files of hyper-parameters
-    """
+    """The shipped files by name, such as ``aarl_state`` or ``body/simba``: configurations of searches, or hyper-parameters."""
     folder = SEARCHES if searches else ZOO
     files = [path for path in sorted(folder.rglob("*.yml")) if searches or SEARCHES not in path.parents]
     return {path.relative_to(folder).with_suffix("").as_posix(): path for path in files}
@@ -23,9 +19,6 @@ def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path
     A file that is there, or else the shipped one of that name: ``demo``, ``body/simba``, ``simba``,
     ``zoo_configs/body/simba.yml``.
 
-    :param path: Path or name
-    :param searches: Whether it is the configuration of a search, or a file of hyper-parameters
-    :param folder: What the path is relative to
     :raises ValueError: with the nearest name, when there is no such file
     """
     if (folder / path).is_file():
