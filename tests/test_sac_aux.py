@@ -364,6 +364,7 @@ def test_train_agrees_with_naive_steps(
         learning_rate=2e-3,
         encoder_learning_rate=3e-3,
         ent_coef_learning_rate=1e-2,
+        ent_coef_betas=(0.5, 0.999),
         aux_coef=0.7,
         aux_batch_size=24,
         gamma=0.9,
