@@ -135,7 +135,7 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
     assert [point.environment_steps for point in curve] == [200, 400]
     for point in curve:
         assert re.search(rf"{point.environment_steps:,}\D+{abs(point.mean):.1f}\D+{point.std:.1f}", result.stdout)
-    assert f"AULC {(curve[0].mean + curve[1].mean) / 2:.1f}" in result.stdout
+    assert f"(AULC) {(curve[0].mean + curve[1].mean) / 2:.1f}" in result.stdout
     assert "here/model.zip" in result.stdout and "here/curve.csv" in result.stdout
     model = SACAux.load("here/model.zip")
     assert model.aux_loss == AuxLoss.parse("{s_t} -> {r_t, s_t+1}")

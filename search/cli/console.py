@@ -103,6 +103,7 @@ def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
     formats |= dict.fromkeys(("ms an environment step", "ms a gradient step", "hours of a run", "core hours"), "{:.3g}")
     formats["MB of buffer"] = "{:,.1f}"
     shown = pd.DataFrame({name: found[name].map(text.format) for name, text in formats.items()})
+    shown.columns = shown.columns.str.replace(" ", "\n")
     shown.insert(0, "", list(kinds))
     show_table(shown, "Measured here")
     n_runs = found["runs"].sum()

@@ -145,7 +145,10 @@ def status(
         say_json(data)
         return
     columns = ["variant", "runs", "done", "running", "failed", "score"]
-    shown = [{name: str(row.get(name, "")) for name in columns} | {"score": number(row.get("score"))} for row in rows]
+    shown = [
+        {name: str(row.get(name, "")) for name in columns} | {"score": number(row["score"]) if "score" in row else ""}
+        for row in rows
+    ]
     show_table(pd.DataFrame(shown), str(path))
     for line in lines:
         say(line)

@@ -1,5 +1,6 @@
 """Commands for one run: train with a loss, list the losses that have a name; evaluate and film what was trained."""
 
+import itertools
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from search.cli.console import console, errors, print_wide, say, say_json, time_to_go
+from search.cli.console import console, errors, say, say_json, time_to_go
 from search.cli.options import SHIPPED, Json, Model
 from search.training.shipped import find_file
 
@@ -65,7 +66,8 @@ def train(
     if json:
         say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})
         return
-    table = Table("environment steps", "mean return", "deviation", "seconds", title=f"AULC {aulc(curve):.1f}")
+    title = f"Mean of the evaluations (AULC) {aulc(curve):.1f}"
+    table = Table("environment steps", "mean return", "deviation", "seconds", title=title)
     for column in table.columns:
         column.justify = "right"
     for point in curve:
@@ -100,7 +102,7 @@ def configs(json: Json = False) -> None:
 
     kinds = {"Hyper-parameters: aarl train --config NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
     found = {
-        title: {name: path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for name, path in files.items()}
+        title: {name: first_sentence(path) for name, path in files.items()}
         for title, files in ((title, shipped_files(searches)) for title, searches in kinds.items())
     }
     if json:
@@ -108,9 +110,16 @@ def configs(json: Json = False) -> None:
         return
     for title, names in found.items():
         table = Table("name", "what it is", title=title, title_justify="left")
+        table.columns[0].no_wrap = True
         for row in names.items():
             table.add_row(*row)
-        print_wide(table)
+        console.print(table)
+
+
+def first_sentence(path: Path) -> str:
+    """The first sentence of the comment that a file begins with."""
+    comment = itertools.takewhile(lambda line: line.startswith("#"), path.read_text(encoding="utf-8").splitlines())
+    return " ".join(line.lstrip("# ") for line in comment).partition(". ")[0].rstrip(".:")
 
 
 @app.command()

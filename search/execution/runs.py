@@ -58,7 +58,8 @@ def start_run(folder: str) -> dict[str, Any]:
     outcome = read_outcome(path)
     if outcome is None:  # it was killed, or told to stop
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        failure = f"the run's process was killed ({how}), see {path / OUTPUT}" if code else None
+        said = (path / OUTPUT).read_text(encoding="utf-8", errors="replace").strip().rpartition("\n")[2]
+        failure = f"the run's process ended with {how}: {said} (see {path / OUTPUT})" if code else None
         outcome = Outcome(partial_curve(path), failure, retry=bool(code))
     return {"curve": [list(row) for row in outcome.curve], "failure": outcome.failure, "retry": outcome.retry}
 
@@ -67,7 +68,8 @@ def _train(folder: Path) -> int:
     """Train a run in a process, whose exit code is returned."""
     threads = read_run(folder).threads
     command = [sys.executable, "-m", "search.training.run", str(folder), "--end-with-stdin"]
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    # A user's own search.py in the working directory is not the package.
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "PYTHONSAFEPATH": "1"}
     # A session of its own: Ctrl-C reaches the driver only, whose end closes the pipe.
     with (
         (folder / OUTPUT).open("ab") as output,

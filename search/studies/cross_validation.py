@@ -74,7 +74,7 @@ def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
     files take, and return it.
     """
     winner = AuxLoss.parse(str(table.index[0]))
-    score = {"mean_aulc": round(float(table["mean"].iloc[0]), 3), "runs": int(table["runs"].iloc[0])}
-    comment = f"# Best of {len(table)} candidates in cross-validation: {score}\n"
+    mean, runs = table["mean"].iloc[0], table["runs"].iloc[0]
+    comment = f"# Best of {len(table)} candidates in cross-validation: mean score {mean:.3f} of {runs} runs\n"
     replace_text(path, comment + yaml.safe_dump({"aux_loss": winner}, sort_keys=False))
     return winner

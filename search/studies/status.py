@@ -33,12 +33,16 @@ def search_status(study: optuna.Study, folder: Path) -> tuple[driver.SearchProgr
 def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     """
     One row for each variant of a matrix: ``variant``, ``runs``, ``done``, ``running``, ``failed`` and ``score`` (mean AULC of
-    those that are done); and the estimated seconds until all are over, None while that is not known.
+    those that are done, None where they are of several environments); and the estimated seconds until all are over, None while
+    that is not known.
     """
     runs: dict[str, list[tuple[Outcome | None, bool]]] = defaultdict(list)
+    tasks: dict[str, set[str]] = defaultdict(set)
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
         outcome = read_outcome(path)
-        runs[read_about(path)["variant"]].append((outcome, outcome is None and is_locked(path / LOCK)))
+        variant = read_about(path)["variant"]
+        runs[variant].append((outcome, outcome is None and is_locked(path / LOCK)))
+        tasks[variant].add(path.parent.name)
     rows: list[dict[str, Any]] = []
     seconds: list[float] = []
     for variant, found in runs.items():
@@ -46,7 +50,7 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
         seconds += [curve[-1].seconds for curve in done]
         row = {"variant": variant, "runs": len(found), "done": len(done), "running": sum(runs for _, runs in found)}
         row["failed"] = sum(outcome is not None for outcome, _ in found) - len(done)
-        rows.append({**row, "score": sum(map(aulc, done)) / len(done) if done else None})
+        rows.append({**row, "score": sum(map(aulc, done)) / len(done) if done and len(tasks[variant]) == 1 else None})
     table = pd.DataFrame(rows, columns=["variant", "runs", "done", "running", "failed", "score"])
     left = int((table["runs"] - table["done"] - table["failed"]).sum())
     to_go = sum(seconds) / len(seconds) * left / max(1, int(table["running"].sum())) if seconds else None

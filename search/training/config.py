@@ -184,8 +184,11 @@ def resolve_env_id(name: str) -> str:
         return full
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
     nearest = difflib.get_close_matches(name, known, cutoff=0.4)
-    hint = "" if env_ids() else f". {NEEDS_DMC}"
-    raise ConfigError(f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}{hint}")
+    hint = "" if env_ids() else f" {NEEDS_DMC}"
+    raise ConfigError(
+        f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}. "
+        f"A module of yours that registers it belongs to the imports.{hint}"
+    )
 
 
 def import_modules(names: Sequence[str]) -> Sequence[str]:

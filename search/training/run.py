@@ -230,7 +230,7 @@ class Setup:
         self.episode_steps = limit
         apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
         if limit is not None and apart < limit * self.n_envs:
-            message = "evaluations are %d environment steps apart, and truncate episodes, which may have %d"
+            message = "evaluating every %d environment steps truncates episodes, which may have %d"
             logger.warning(message, apart // self.n_envs, limit)
 
     def _make(self, steps: Sequence[int] = ()) -> Callable[[], gym.Env]:
