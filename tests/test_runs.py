@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -60,6 +61,14 @@ def test_retries_run_out(tmp_path: Path) -> None:
         submission = Submission(executor, tmp_path, tiny_run(imports=("no_such_module",)), retries=1)
         wait_done(submission)
     assert submission.failure is not None and "no_such_module" in submission.failure
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python has the working directory first in its path")
+def test_a_search_py_in_the_working_directory_is_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("search.py").write_text("raise SystemExit('not this one')")
+    prepare_run(tmp_path / "run", tiny_run())
+    assert start_run(str(tmp_path / "run"))["failure"] is None
 
 
 def test_a_finished_run_is_read(tmp_path: Path) -> None:

@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from search.cli.console import errors, live, records, say, say_json, show_costs, show_table, time_to_go
-from search.cli.options import SHIPPED, DryRun, Folder, Json, SearchFile, Storage, Threads, Workers, read_config, run_folder
+from search.cli.options import (
+    SHIPPED,
+    DryRun,
+    Folder,
+    Imports,
+    Json,
+    SearchFile,
+    Storage,
+    Threads,
+    Workers,
+    read_config,
+    run_folder,
+)
 from search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -82,7 +94,7 @@ def exit_if_failed(matrix: "Matrix") -> None:
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def baselines(
     config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
 ) -> None:
@@ -99,7 +111,7 @@ def baselines(
     exit_if_failed(matrix)
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def select_operator(
     config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
 ) -> None:
@@ -113,7 +125,7 @@ def select_operator(
     exit_if_failed(matrix)
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def cross_validate(
     config: SearchFile,
     top: Annotated[int | None, typer.Option(help="How many candidates. Default: the file's.", min=1)] = None,
@@ -140,7 +152,7 @@ def cross_validate(
     exit_if_failed(matrix)
 
 
-@app.command()
+@app.command(rich_help_panel="Many agents")
 def benchmark(
     configs: Annotated[
         list[Path],
@@ -169,6 +181,7 @@ def benchmark(
     folder: Annotated[
         Path, typer.Option(help="Folder of the benchmark; more variants, tasks and seeds may be added to it.")
     ] = Path("runs/benchmark"),
+    imports: Imports = "",
     dry_run: DryRun = False,
     json: Json = False,
 ) -> None:
@@ -181,7 +194,8 @@ def benchmark(
     between = parse_steps(every) if every else (None,)
     if len(between) != 1:
         raise ValueError(f"--every is one number of environment steps, not {every}")
-    matrix = load_benchmark(configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder)
+    modules = imports.split(",") if imports else ()
+    matrix = load_benchmark(configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder, modules)
     if dry_run:
         show_costs(unfinished(matrix), workers)
         return

@@ -21,6 +21,7 @@ SearchFile = Annotated[
     ),
 ]
 SHIPPED = "a file, or one of `aarl configs` by name"
+Imports = Annotated[str, Option(help="Modules of yours that register environments, such as my_env,other.")]
 DryRun = Annotated[
     bool, Option("--dry-run", help="Start nothing: measure some steps here, and show what all runs would cost.")
 ]

@@ -32,7 +32,7 @@ ANALYSES = {
 N_IMPORTANCES = 20
 
 
-@app.command()
+@app.command(rich_help_panel="Many agents")
 def table(
     folder: options.Benchmark = Path("runs/benchmark"),
     json: options.Json = False,
@@ -64,7 +64,7 @@ def say_missing(runs: "pd.DataFrame") -> None:
         say(line, style="red")
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def analyze(
     folders: options.SearchFolders = None,
     storage: Storage = None,
@@ -101,7 +101,7 @@ def analyze(
         show_table(layout, "Differences of all studies, as the paper's table 5")
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def status(
     folder: Annotated[
         Path | None, typer.Argument(help="Folder of a search or a benchmark, or a search's file. Default: the only search.")
@@ -159,7 +159,7 @@ def number(value: float | None) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.2f}"
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def report(
     folder: options.SearchFolder = None,
     storage: Storage = None,
@@ -175,7 +175,7 @@ def report(
     say(f"Report: {out}")
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def dashboard(
     folder: options.SearchFolder = None,
     storage: Storage = None,

@@ -22,7 +22,7 @@ app = typer.Typer()
 PLOT_SECONDS = 60.0
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def search(
     config: SearchFile,
     storage: Storage = None,

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from search.cli.console import console, errors, say, say_json, time_to_go
-from search.cli.options import SHIPPED, Json, Model
+from search.cli.options import SHIPPED, Imports, Json, Model
 from search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ FPS = 30  # pictures a second of a video
 ModelEnv = Annotated[str | None, typer.Argument(help="Environment. Default: that of the model's run.")]
 
 
-@app.command()
+@app.command(rich_help_panel="One agent")
 def train(
     env: Annotated[str, typer.Argument(help="Such as cheetah-run, dm_control/cheetah-run-v0 or Pendulum-v1.")],
     aux_loss: Annotated[
@@ -40,7 +40,7 @@ def train(
     seed: Annotated[int, typer.Option(help="Seed of the run.", min=0)] = 0,
     threads: Annotated[int, typer.Option(help="Threads of PyTorch.", min=1)] = 1,
     folder: Annotated[Path | None, typer.Option(help="Folder for model and learning curve. Default: in runs/.")] = None,
-    imports: Annotated[str, typer.Option(help="Modules of yours that register environments, such as my_env,other.")] = "",
+    imports: Imports = "",
     json: Json = False,
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
@@ -76,7 +76,7 @@ def train(
     say(f"Model: {path / 'model.zip'}\nCurve: {path / 'curve.csv'}")
 
 
-@app.command()
+@app.command(rich_help_panel="One agent")
 def losses(
     published: Annotated[bool, typer.Option("--published", help="The paper's candidates too.")] = False, json: Json = False
 ) -> None:
@@ -95,7 +95,7 @@ def losses(
     console.print(table)
 
 
-@app.command()
+@app.command(rich_help_panel="One agent")
 def configs(json: Json = False) -> None:
     """List the configurations that come with the package, for commands that take a file."""
     from search.training.shipped import shipped_files
@@ -122,7 +122,7 @@ def first_sentence(path: Path) -> str:
     return " ".join(line.lstrip("# ") for line in comment).partition(". ")[0].rstrip(".:")
 
 
-@app.command()
+@app.command(rich_help_panel="A search")
 def init(path: Annotated[Path, typer.Argument(help="File to write, such as own.yml.")]) -> None:
     """Write the configuration of a search on an environment of your own, with comments, to edit."""
     with path.open("x", encoding="utf-8") as file:
@@ -130,7 +130,7 @@ def init(path: Annotated[Path, typer.Argument(help="File to write, such as own.y
     say(f"{path}: a search on Pendulum-v1, to edit. What it costs: aarl search {path} --dry-run")
 
 
-@app.command()
+@app.command(rich_help_panel="One agent")
 def evaluate(
     model: Model,
     env: ModelEnv = None,
@@ -148,7 +148,7 @@ def evaluate(
         say(f"{np.mean(returns):.1f} ± {np.std(returns):.1f}, mean and deviation of {episodes} episodes")
 
 
-@app.command()
+@app.command(rich_help_panel="One agent")
 def video(
     model: Model,
     env: ModelEnv = None,

@@ -13,7 +13,7 @@ import pandas as pd
 from sb3_aarl import catalog
 from sb3_aarl.envs import PREFIX
 from search.execution.matrix import Cell, Matrix, task_name
-from search.training.config import ConfigError, action_repeat, load_hyperparameters, read_yaml, resolve_env_id
+from search.training.config import ConfigError, action_repeat, import_modules, load_hyperparameters, read_yaml, resolve_env_id
 from search.training.provenance import ABOUT, read_about
 from search.training.run import FREE, Run, check_run, checkpoint_interval, differences, partial_curve
 
@@ -31,6 +31,7 @@ def load_benchmark(
     evaluation_episodes: int = 10,
     threads: int = 1,
     folder: Path = Path("runs/benchmark"),
+    imports: Sequence[str] = (),
 ) -> Matrix:
     """
     Read the variants of a benchmark, and check all that can be checked without training.
@@ -39,11 +40,13 @@ def load_benchmark(
     :param checkpoints: Environment steps of the comparison; none for those of 100k, 500k and 1000k that lie in
         every file's ``n_timesteps``
     :param every: Environment steps after which runs are also evaluated
+    :param imports: Modules that are imported first, such as those that register environments
     :raises ValueError: naming what is wrong, or which setting differs from that of runs in the folder
     """
     for stem, count in Counter(path.stem for path in files).items():
         if count > 1:
             raise ConfigError(f"two files are called {stem}: a variant has the name of its file")
+    import_modules(imports)
     names = environments or _common_environments(files)
     ids = list(dict.fromkeys(resolve_env_id(name) for name in names))
     # SACAux's default, written out: a file that names no loss is not one that says "none".
@@ -68,6 +71,7 @@ def load_benchmark(
             checkpoints=evaluations,
             evaluation_episodes=evaluation_episodes,
             threads=threads,
+            imports=tuple(imports),
         )
         # What is needed to repeat the run; where and when it was trained is added by the run.
         abouts[cell] = {
