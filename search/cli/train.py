@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from search.cli.console import console, errors, say, say_json, time_to_go
+from search.cli.console import console, errors, print_wide, say, say_json, time_to_go
 from search.cli.options import SHIPPED, Imports, Json, Model
 from search.training.shipped import find_file
 
@@ -113,7 +113,7 @@ def configs(json: Json = False) -> None:
         table.columns[0].no_wrap = True
         for row in names.items():
             table.add_row(*row)
-        console.print(table)
+        (console.print if console.is_terminal else print_wide)(table)
 
 
 def first_sentence(path: Path) -> str:
