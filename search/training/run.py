@@ -320,6 +320,8 @@ def _train(
     state = checkpoint.read(folder)
     curve = [Evaluation(*row) for row in state["curve"]] if state else []
     trained = curve[-1].environment_steps if curve else 0
+    if curve:
+        logger.warning("%s is resumed at %d environment steps", folder, trained)
     with closing_env(setup.training_env(trained)) as env, closing_env(setup.evaluation_env()) as evaluation_env:
         model = setup.model(env)
         evaluations = LearningCurveCallback(
