@@ -190,6 +190,11 @@ def test_figures_of_the_first_readme() -> None:
         assert " | ".join([row, *(shown(last_returns(variant, task)) for variant in variants)]) in readme
     n_runs = [len(last_returns(variant, task)) for variant in variants for task in TASKS]
     assert n_runs == [3] * 6 + [n_runs[6]] * 2 and f"over 3 seeds, {n_runs[6]} of the last" in readme
+    ours, sacs = (
+        " and ".join(f"{value:,.0f}" for value in last_returns(variant, "HalfCheetah-v5", "defaults"))
+        for variant in ("entropy_sac", "sac")
+    )
+    assert f"SACAux {ours}, SAC {sacs}." in readme
     paper = paper_scores(4).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'").set_index("column")
     for text, variant, column in (
         ("AARL-State gets {} on Cheetah-Run, where the paper has {}", "aarl_state_bf16", "AARL-State"),
