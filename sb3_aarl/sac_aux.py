@@ -50,7 +50,7 @@ class SACAux(SAC):
     encoder of the target critic is the momentum encoder of the auxiliary loss. Arguments of SB3's SAC have its defaults,
     those of SACAux alone the paper's (tables 7 and 8) unless another source is named; all of the paper's values are in
     ``zoo_configs/``. The entropy coefficient learns as SAC's: at the paper's rate it takes too long
-    to fall from SAC's 1 (HalfCheetah-v5, 30,000 steps: 841, at SAC's rate 5,002 and 2,246).
+    to fall from SAC's 1 (HalfCheetah-v5, 30,000 steps: 841, at SAC's rate 5,003 and 2,246).
 
     :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
