@@ -77,7 +77,7 @@ def total(setting: str, device: str, mode: str, processes: int, threads: int, se
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     device = "cuda" if th.cuda.is_available() else "cpu"
-    parser.add_argument("--settings", nargs="+", default=["state"], choices=["state", "pixels"])
+    parser.add_argument("--settings", nargs="+", default=["state"], choices=["state", "small", "pixels"])
     parser.add_argument("--device", default=device, choices=["cpu", "cuda"])
     parser.add_argument("--modes", nargs="+", default=list(modes("pixels", device)), choices=list(modes("pixels", "cuda")))
     parser.add_argument("--processes", nargs="+", type=int, default=[1, 2] if device == "cpu" else [1, 2, 4, 8, 16])
