@@ -49,8 +49,8 @@ class SACAux(SAC):
     The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The
     encoder of the target critic is the momentum encoder of the auxiliary loss. Arguments of SB3's SAC have its defaults,
     those of SACAux alone the paper's (tables 7 and 8) unless another source is named; all of the paper's values are in
-    ``zoo_configs/``. The entropy coefficient learns as SAC's: at the paper's rate it takes too long
-    to fall from SAC's 1 (HalfCheetah-v5, 30,000 steps: 841, at SAC's rate 5,003 and 2,246).
+    ``zoo_configs/``. The entropy coefficient learns as SAC's: at the paper's rate it takes too long to fall from SAC's 1
+    (HalfCheetah-v5, 30,000 steps: 841, at SAC's rate 5,003 and 2,246).
 
     :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
@@ -410,7 +410,7 @@ class SACAux(SAC):
                     with autocast:
                         actor_loss = self._actor_loss(batch.observations, actions_pi, log_prob, ent_coef)
                     log("actor_loss", actor_loss)
-                    trained = [parameter for parameter in self.actor.own_parameters() if parameter.requires_grad]
+                    trained = [p for p in self.actor.optimizer.param_groups[0]["params"] if p.requires_grad]
                     if trained:
                         self.actor.optimizer.zero_grad()
                         actor_loss.backward(inputs=trained)

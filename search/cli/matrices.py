@@ -17,6 +17,7 @@ from search.cli.options import (
     Storage,
     Threads,
     Workers,
+    modules,
     read_config,
     run_folder,
 )
@@ -194,8 +195,7 @@ def benchmark(
     between = parse_steps(every) if every else (None,)
     if len(between) != 1:
         raise ValueError(f"--every is one number of environment steps, not {every}")
-    modules = imports.split(",") if imports else ()
-    matrix = load_benchmark(configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder, modules)
+    matrix = load_benchmark(configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder, modules(imports))
     if dry_run:
         show_costs(unfinished(matrix), workers)
         return

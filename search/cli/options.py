@@ -50,6 +50,11 @@ Patterns = Annotated[
 ]
 
 
+def modules(imports: str) -> list[str]:
+    """The modules that ``--imports`` names."""
+    return imports.split(",") if imports else []
+
+
 def read_config(path: Path, **changes: Any) -> "SearchConfig":
     """The configuration of a search, with the values of options over those of its file; that its runs can start is checked."""
     from search.studies.config import load_config

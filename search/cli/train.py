@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from search.cli.console import console, errors, print_wide, say, say_json, time_to_go
-from search.cli.options import SHIPPED, Imports, Json, Model
+from search.cli.options import SHIPPED, Imports, Json, Model, modules
 from search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -59,9 +59,8 @@ def train(
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
-    modules = imports.split(",") if imports else ()
     curve, path = train_one(
-        env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation, modules
+        env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation, modules(imports)
     )
     if json:
         say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})
