@@ -199,18 +199,23 @@ def policy(**kwargs: Any) -> dict[str, Any]:
     return {"policy_kwargs": kwargs}
 
 
-# How each differs from dense_mlp.yml; None: the key is not there.
+# How each differs from dense_mlp.yml; None: the key is not there. Those of `default_` differ from SACAux's defaults.
 BODIES: dict[str, dict[str, Any]] = {
     "dense_mlp": {},
     "dense_mlp_heads": policy(net_arch=[128], network="simba"),
     "dense_mlp_normalized": {"normalize": {"norm_reward": False}},
     "simba": {},
+    "simba_bf16": {"precision": "bf16"},
     "simba_all": policy(net_arch=[128], network="simba"),
     "simba_critic_norm": policy(network={"pi": "mlp", "qf": "layer_norm"}),
     "simba_no_aux": {"aux_loss": None, "encoder_tau": None, "predictor_width": None},
     "simba_two_steps": {"gradient_steps": 2},
     "simba_unnormalized": policy(features_extractor_kwargs={"normalize": False}),
     "simba_weight_decay": policy(optimizer_kwargs={"weight_decay": 0.01, "decoupled_weight_decay": True}),
+    "default_simba": policy(features_extractor_class="simba"),
+    "default_simba_bf16": {**policy(features_extractor_class="simba"), "precision": "bf16"},
+    "default_simba_no_aux_bf16": {**policy(features_extractor_class="simba"), "aux_loss": None, "precision": "bf16"},
+    "default_dense_mlp_bf16": {**policy(features_extractor_class="dense_mlp"), "precision": "bf16"},
 }
 
 
@@ -229,6 +234,9 @@ def test_bodies_differ_in_nothing_else() -> None:
             if name.startswith("simba"):
                 wanted["policy_kwargs"] |= {"features_extractor_class": "simba", "features_extractor_kwargs": None}
             wanted = merge(wanted, {"learning_rate": 3e-4, **changes})
+            if name.startswith("default_"):
+                wanted = {**load_hyperparameters(ZOO / "default.yml", env_id), **changes, "n_timesteps": 25_000}
+                wanted["env_kwargs"] = {"action_repeat": 4}
             if env_id.startswith(("dm_control/walker", "dm_control/finger")):
                 wanted |= {"n_timesteps": 50_000, "env_kwargs": {"action_repeat": 2}}
             assert plain(load_hyperparameters(path, env_id)) == plain(wanted)
