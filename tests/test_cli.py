@@ -150,13 +150,14 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
     ("arguments", "message"),
     [
         (["cartpole-blance"], "nearest: cartpole-balance"),
+        (["own_env:Own-v0"], "'own_env' as one of the imports"),
         (["Pendulum-v1", "--aux-loss", "curll"], "nearest: curl"),
         (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "position 10"),
         (["Pendulum-v1", "--steps", "3", "--evaluations", "5"], "too few"),
         (["Pendulum-v1", "--config", "body/simbaa"], "nearest: body/simba"),
         (["CartPole-v1", "--steps", "1000"], "CartPole-v1 cannot be trained"),
     ],
-    ids=["environment", "name", "notation", "steps", "file", "actions"],
+    ids=["environment", "module", "name", "notation", "steps", "file", "actions"],
 )
 def test_errors_of_train_are_one_line(arguments: list[str], message: str, folder: Path) -> None:
     write_search(folder)

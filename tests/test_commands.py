@@ -243,6 +243,7 @@ def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
     (trained / "model.zip").rename("alone.zip")
     assert "which environment?" in run("evaluate", "alone.zip", code=2)
     assert "spaces do not match" in run("evaluate", "alone.zip", "Pendulum-v1", code=2)
+    assert "no_env cannot be imported" in run("evaluate", "alone.zip", "Own-v0", "--imports", "no_env", code=2)
     assert "model.zip does not exist" in run("video", trained, code=2)
 
 

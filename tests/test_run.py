@@ -415,6 +415,14 @@ def test_evaluations_closer_than_an_episode(
     assert len(warnings) == n_warnings and all("truncate" in warning for warning in warnings)
 
 
+def test_a_run_too_short_to_learn_is_said_before_it_starts(caplog: pytest.LogCaptureFixture) -> None:
+    check_run(make_run(hyperparameters=DENSE | {"learning_starts": 64}))
+    check_run(make_run(hyperparameters=DENSE | {"learning_starts": 63}))
+    assert [record.getMessage() for record in caplog.records] == [
+        "64 agent steps are all random actions: learning_starts is 64"
+    ]
+
+
 @pytest.mark.parametrize(
     ("hyper", "interval"),
     [

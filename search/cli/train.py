@@ -135,12 +135,13 @@ def evaluate(
     env: ModelEnv = None,
     episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 10,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
+    imports: Imports = "",
     json: Json = False,
 ) -> None:
     """Show the return of a trained model: mean and deviation of episodes with its best actions."""
     import numpy as np
 
-    returns = play(model, env, episodes, seed)
+    returns = play(model, env, episodes, seed, imports)
     if json:
         say_json({"mean": float(np.mean(returns)), "std": float(np.std(returns)), "returns": returns})
     else:
@@ -153,6 +154,7 @@ def video(
     env: ModelEnv = None,
     episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
+    imports: Imports = "",
     out: Annotated[
         Path | None, typer.Option(help=".gif, or .mp4 (pip install imageio-ffmpeg). Default: video.gif beside the model.")
     ] = None,
@@ -162,20 +164,20 @@ def video(
 
     path = out or (model if model.is_dir() else model.parent) / "video.gif"
     frames: list[Any] = []
-    returns = play(model, env, episodes, seed, frames)
+    returns = play(model, env, episodes, seed, imports, frames)
     path.parent.mkdir(parents=True, exist_ok=True)
     # GIF counts in milliseconds, and repeats.
     imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix == ".gif" else {"fps": FPS}))
     say(f"Video: {path}, {len(frames)} pictures, returns {', '.join(f'{value:.1f}' for value in returns)}")
 
 
-def play(model: Path, env: str | None, episodes: int, seed: int, frames: list[Any] | None = None) -> list[float]:
+def play(model: Path, env: str | None, episodes: int, seed: int, imports: str, frames: list[Any] | None = None) -> list[float]:
     """The returns of a model's episodes, and, where wanted, their pictures."""
     from stable_baselines3.common.evaluation import evaluate_policy
 
     from search.studies.single import load_trained
 
-    trained, environment = load_trained(model, env, renders=frames is not None)
+    trained, environment = load_trained(model, env, frames is not None, modules(imports))
     environment.seed(seed)
     film = None if frames is None else lambda *_: frames.append(environment.render())
     returns, _ = evaluate_policy(trained, environment, episodes, callback=film, return_episode_rewards=True)

@@ -99,10 +99,13 @@ def train_one(
     return train(folder, progress_bar, on_evaluation), folder
 
 
-def load_trained(path: Path, environment: str | None = None, renders: bool = False) -> tuple[SACAux, VecEnv]:
+def load_trained(
+    path: Path, environment: str | None = None, renders: bool = False, imports: Sequence[str] = ()
+) -> tuple[SACAux, VecEnv]:
     """
     A trained model, and an environment for it: that of the run that it is from, or another one.
 
+    :param imports: Modules that are imported first, beside those of the run
     :raises ValueError: when there is no model, or the environment is not known
     """
     folder = path if path.is_dir() else path.parent
@@ -110,8 +113,7 @@ def load_trained(path: Path, environment: str | None = None, renders: bool = Fal
     if not model.is_file():
         raise ValueError(f"{model} does not exist: name a model, or the folder of a run that has one, such as of aarl train")
     run = read_run(folder) if (folder / RUN).exists() else None
-    if run is not None:
-        import_modules(run.imports)
+    import_modules([*(run.imports if run else ()), *imports])
     if environment is None and run is None:
         raise ValueError(f"which environment? {folder} has no {RUN} that names it")
     env_id = resolve_env_id(environment) if environment is not None else run.environment  # type: ignore[union-attr]

@@ -176,9 +176,11 @@ def resolve_env_id(name: str) -> str:
 
     :raises ConfigError: for an unknown one, with the nearest
     """
-    # Not gym.spec or gym.make, which import what stands before a colon.
     if name in gym.registry:
         return name
+    module, colon, env_id = name.rpartition(":")
+    if colon:  # gym.make would import it, and the processes of the runs would not
+        raise ConfigError(f"write {env_id!r} for {name!r}, and {module!r} as one of the imports")
     full = f"{PREFIX}{name.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
     if full in env_ids():
         return full

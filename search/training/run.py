@@ -252,7 +252,11 @@ class Setup:
         return env if self.normalize is None else VecNormalize(env, **{**self.normalize, **FIXED})
 
     def model(self, env: VecEnv) -> SACAux:
-        return SACAux(self.policy, env, **self.settings)
+        model = SACAux(self.policy, env, **self.settings)
+        if self.agent_steps <= model.learning_starts:
+            message = "%d agent steps are all random actions: learning_starts is %d"
+            logger.warning(message, self.agent_steps, model.learning_starts)
+        return model
 
 
 def check_run(run: Run) -> None:
