@@ -206,6 +206,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "dense_mlp_normalized": {"normalize": {"norm_reward": False}},
     "simba": {},
     "simba_bf16": {"precision": "bf16"},
+    "simba_64_bf16": {"precision": "bf16", **policy(features_extractor_kwargs={"features_dim": 64})},
     "simba_all": policy(net_arch=[128], network="simba"),
     "simba_critic_norm": policy(network={"pi": "mlp", "qf": "layer_norm"}),
     "simba_no_aux": {"aux_loss": None, "encoder_tau": None, "predictor_width": None},
