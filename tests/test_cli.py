@@ -311,6 +311,19 @@ def test_cross_validation_ranks_what_is_complete(searched: optuna.Study, executo
     assert f"Winner: {best}" in run("cross-validate", "small.yml", "--top", 1) and len(executor.runs) == n_runs + 1
 
 
+def test_a_cross_validation_with_baselines(searched: optuna.Study, executor: Executor) -> None:
+    executor.scores = {str(loss): float(score) for score, loss in enumerate(LOSSES)} | {None: 9.0}
+    output = run("cross-validate", "small.yml", "--baselines")
+    # The best row is a baseline, the winner the best candidate.
+    rows = [line.split()[1] for line in output.splitlines() if line.startswith("│")]
+    assert rows[:2] == ["SAC", "{s_t,"] and "CURL" in rows and f"Winner: {LOSSES[-1]}" in output
+    assert {(r.environment, r.seed) for r in executor.runs if r.aux_loss is None} == {
+        (environment, seed) for environment in ("Pendulum-v1", "MountainCarContinuous-v0") for seed in (2, 3)
+    }
+    run("report", "runs/small")
+    assert "CURL" in Path("runs/small/report.html").read_text().partition("Cross-validation")[2]
+
+
 def test_an_environment_on_which_all_fail_is_no_reason_not_to_rank(searched: optuna.Study, executor: Executor) -> None:
     executor.scores = {str(loss): float(score) for score, loss in enumerate(LOSSES)}
     executor.fails = lambda run: run.environment != "Pendulum-v1"

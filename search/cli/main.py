@@ -12,7 +12,7 @@ from search.cli import figures, matrices, results, search, train
 from search.cli.console import errors
 
 # Training alone does without these modules; the extra that has them.
-EXTRAS = {"imageio": "dmc", "psycopg": "postgres", "ray": "ray"}
+EXTRAS = {"imageio": "search", "psycopg": "postgres", "ray": "ray"}
 OF_SEARCH = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "plotly", "scipy", "sklearn", "sqlalchemy", "tenacity")
 
 
@@ -37,6 +37,8 @@ def explain(error: Exception) -> str | None:
     """One line, without passwords, about an error that a user can fix; None for another one."""
     kinds: list[type[Exception]] = [ValueError, OSError, FloatingPointError]
     line = " ".join(str(error).split())
+    if isinstance(error, OSError) and error.filename is not None:
+        line = f"{error.filename}: {error.strerror}"
     if isinstance(error, ModuleNotFoundError):
         module = (error.name or "").partition(".")[0]
         extra = "search" if module in OF_SEARCH else EXTRAS.get(module)

@@ -130,6 +130,9 @@ def select_operator(
 def cross_validate(
     config: SearchFile,
     top: Annotated[int | None, typer.Option(help="How many candidates. Default: the file's.", min=1)] = None,
+    with_baselines: Annotated[
+        bool, typer.Option("--baselines", help="Train the file's baselines too, with the same environments and seeds.")
+    ] = False,
     storage: Storage = None,
     workers: Workers = 1,
     threads: Threads = None,
@@ -143,11 +146,12 @@ def cross_validate(
     settings = read_config(config, threads=threads)
     path = run_folder(config, folder)
     searched = load_study(open_storage(path, storage, create=False), settings.name)
-    matrix = cross_validation.make_matrix(settings, searched, path, top)
+    matrix = cross_validation.make_matrix(settings, searched, path, top, settings.baselines if with_baselines else ())
     train_matrix(matrix, workers, settings.retries)
     table = compare(matrix, cross_validation.ranking, "Cross-validation, AULC", json)
-    if table is not None:
-        winner = cross_validation.write_winner(table, path / "winner.yml")
+    names = [baseline.name for baseline in settings.baselines]
+    if table is not None and not (candidates := table.drop(index=names, errors="ignore")).empty:
+        winner = cross_validation.write_winner(candidates, path / "winner.yml")
         if not json:
             say(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}")
     exit_if_failed(matrix)

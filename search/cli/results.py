@@ -118,12 +118,12 @@ def status(
     path = search_folder(folder, storage)
     data: dict[str, Any] = {}
     lines = []
-    rows: list[dict[Any, Any]] = []
+    tables: dict[str, list[dict[Any, Any]]] = {}
     if storage is not None or path is None or (path / STUDY_FILE).exists():
         ((study, path),) = open_studies([folder], storage).values()
         progress, runs = search_status(study, path)
         data["search"] = {**progress._asdict(), "generations": [row._asdict() for row in progress.generations], "runs": runs}
-        rows += [
+        tables["search"] = [
             {"variant": f"generation {row.generation}", "runs": row.slots, "done": row.filled, **row._asdict()}
             for row in progress.generations
         ]
@@ -137,19 +137,20 @@ def status(
         found, to_go = matrix_status(path / part)
         if not found.empty:
             data[part or "benchmark"] = {"variants": records(found.set_index("variant")), "seconds_to_go": to_go}
-            rows += found.to_dict("records")
+            tables[part or "benchmark"] = found.to_dict("records")
             lines.append(f"{(part or 'benchmark').capitalize()}: {time_to_go(to_go)}")
-    if not rows:
+    if not tables:
         raise ValueError(f"{path} has neither a search nor a benchmark")
     if json:
         say_json(data)
         return
     columns = ["variant", "runs", "done", "running", "failed", "score"]
-    shown = [
-        {name: str(row.get(name, "")) for name in columns} | {"score": number(row["score"]) if "score" in row else ""}
-        for row in rows
-    ]
-    show_table(pd.DataFrame(shown), str(path))
+    for title, rows in tables.items():
+        shown = [
+            {name: str(row.get(name, "")) for name in columns} | {"score": number(row["score"]) if "score" in row else ""}
+            for row in rows
+        ]
+        show_table(pd.DataFrame(shown), f"{path}, {title}")
     for line in lines:
         say(line)
 

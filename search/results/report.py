@@ -113,13 +113,18 @@ def _typeset(loss: AuxLoss | None) -> Markup:
     return Markup('<div class="loss">{}</div><code>{}</code>').format(Markup(mathml(loss)), str(loss))
 
 
+def _variant(name: str) -> Markup:
+    """A candidate or a baseline."""
+    return _typeset(AuxLoss.parse(name)) if "->" in name else Markup.escape(name)
+
+
 def _validation(runs: pd.DataFrame | None) -> dict[str, Any] | None:
     """The ranking of the candidates that have all runs, and how many are left out."""
     if runs is None or comparable(runs).empty:
         return None
     ranking = cross_validation.ranking(comparable(runs))
     text = ranking.map("{:.1f}".format).assign(runs=ranking["runs"].map("{:.0f}".format)).rename(columns=task_name)
-    text.insert(0, "Loss", [_typeset(AuxLoss.parse(str(name))) for name in ranking.index])
+    text.insert(0, "Loss", [_variant(str(name)) for name in ranking.index])
     return {"ranking": text, "left_out": runs["variant"].nunique() - len(ranking)}
 
 

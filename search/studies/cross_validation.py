@@ -1,6 +1,8 @@
 """Cross-validation of a search's best candidates (paper, A.4): the best on one environment may have overfitted to it."""
 
 import logging
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import optuna
@@ -12,7 +14,7 @@ from sb3_aarl.callbacks import replace_text
 from search.evolution.space import loss_of
 from search.execution.matrix import Cell, Matrix
 from search.results.trials import ranked
-from search.studies.config import SearchConfig
+from search.studies.config import Baseline, SearchConfig
 from search.studies.search import make_run
 from search.training.config import ConfigError
 
@@ -32,8 +34,13 @@ def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
     return list(losses)[:top]
 
 
-def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, top: int | None = None) -> Matrix:
-    """The runs of a cross-validation: candidates x environments x seeds; ``top`` replaces the configuration's number."""
+def make_matrix(
+    config: SearchConfig, study: optuna.Study, folder: Path, top: int | None = None, baselines: Sequence[Baseline] = ()
+) -> Matrix:
+    """
+    The runs of a cross-validation: candidates and baselines x environments x seeds; ``top`` replaces the configuration's
+    number of candidates.
+    """
     section = config.cross_validation
     if section is None:
         raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
@@ -44,12 +51,13 @@ def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, top: in
             config.environment,
         )
     losses = top_losses(study, section.top if top is None else top)
-    runs = {
-        Cell(str(loss), environment, seed): make_run(config, environment, loss, seed)
-        for seed in section.seeds
-        for environment in section.environments
-        for loss in losses
-    }
+    runs = {}
+    for seed, environment in product(section.seeds, section.environments):
+        for loss in losses:
+            runs[Cell(str(loss), environment, seed)] = make_run(config, environment, loss, seed)
+        for baseline in baselines:
+            run = make_run(config, environment, baseline.aux_loss, seed, baseline.overrides)
+            runs[Cell(baseline.name, environment, seed)] = run
     return Matrix(f"{study.study_name}-cross-validation", folder / "cross-validation", runs)
 
 

@@ -77,7 +77,7 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     """
     entries = read_yaml(path)
     if not {"default", env_id} & entries.keys():
-        raise ConfigError(f"{path}: neither {env_id!r} nor 'default' is there")
+        raise ConfigError(f"{path}: neither {env_id!r} nor 'default' is there, under which hyper-parameters stand")
     merged: dict[str, Any] = {}
     for name in ("default", env_id):
         entry = entries.get(name, {})
@@ -180,16 +180,16 @@ def resolve_env_id(name: str) -> str:
         return name
     module, colon, env_id = name.rpartition(":")
     if colon:  # gym.make would import it, and the processes of the runs would not
-        raise ConfigError(f"write {env_id!r} for {name!r}, and {module!r} as one of the imports")
+        raise ConfigError(f"unknown environment {name!r}: write {env_id!r}, and {module!r} as one of the imports")
     full = f"{PREFIX}{name.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
     if full in env_ids():
         return full
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
     nearest = difflib.get_close_matches(name, known, cutoff=0.4)
-    hint = "" if env_ids() else f" {NEEDS_DMC}"
+    hint = "" if env_ids() or "-v" in name else f" {NEEDS_DMC}"
     raise ConfigError(
         f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}. "
-        f"A module of yours that registers it belongs to the imports.{hint}"
+        f"A module of yours that registers it belongs to the imports (--imports, or imports: in the file).{hint}"
     )
 
 
@@ -204,8 +204,9 @@ def import_modules(names: Sequence[str]) -> Sequence[str]:
     for name in names:
         try:
             importlib.import_module(name)
-        except ImportError as error:
-            raise ConfigError(f"{name} cannot be imported: {error}") from None
+        except Exception as error:  # a user's module may raise anything
+            kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
+            raise ConfigError(f"{name} cannot be imported: {kind}{error}") from error
     return names
 
 

@@ -226,12 +226,8 @@ class Setup:
                 settings[key] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
         self.settings = settings | {"aux_loss": run.aux_loss, "seed": run.seed}
 
-        limit = EPISODE_LENGTH if run.environment.startswith(PREFIX) else gym.spec(run.environment).max_episode_steps
-        self.episode_steps = limit
-        apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
-        if limit is not None and apart < limit * self.n_envs:
-            message = "evaluating every %d environment steps truncates episodes, which may have %d"
-            logger.warning(message, apart // self.n_envs, limit)
+        of_dmc = run.environment.startswith(PREFIX)
+        self.episode_steps = EPISODE_LENGTH if of_dmc else gym.spec(run.environment).max_episode_steps
 
     def _make(self, steps: Sequence[int] = ()) -> Callable[[], gym.Env]:
         run = self.run
@@ -252,27 +248,31 @@ class Setup:
         return env if self.normalize is None else VecNormalize(env, **{**self.normalize, **FIXED})
 
     def model(self, env: VecEnv) -> SACAux:
-        model = SACAux(self.policy, env, **self.settings)
-        if self.agent_steps <= model.learning_starts:
-            message = "%d agent steps are all random actions: learning_starts is %d"
-            logger.warning(message, self.agent_steps, model.learning_starts)
-        return model
+        return SACAux(self.policy, env, **self.settings)
 
 
 def check_run(run: Run) -> None:
     """
-    Make environment and model of a run once.
+    Make environment and model of a run once, and warn of what a user may not have meant.
 
     :raises ConfigError: in one line, when they cannot be made of its settings
     """
     try:
         setup = Setup(run, run.environment)
         with closing_env(setup.training_env()) as env:
-            setup.model(env)
+            learning_starts = setup.model(env).learning_starts
     except ConfigError:
         raise
     except Exception as error:  # Gymnasium, SB3 and PyTorch have errors of all kinds
         raise ConfigError(f"{run.environment} cannot be trained with these settings: {_one_line(error)}") from error
+    if setup.agent_steps <= learning_starts:
+        logger.warning("%d agent steps are all random actions: learning_starts is %d", setup.agent_steps, learning_starts)
+    apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
+    if setup.episode_steps is None:
+        logger.warning("%s has no time limit: an evaluation waits until its episodes end", run.environment)
+    elif apart < setup.episode_steps * setup.n_envs:
+        message = "evaluating every %d environment steps truncates episodes, which may have %d"
+        logger.warning(message, apart // setup.n_envs, setup.episode_steps)
 
 
 @contextlib.contextmanager
