@@ -27,6 +27,7 @@ from search.training.provenance import read_about, write_about
 from search.training.run import (
     Outcome,
     Run,
+    Setup,
     check_run,
     checkpoint_interval,
     is_finished,
@@ -413,6 +414,14 @@ def test_evaluations_closer_than_an_episode(
     check_run(make_run(checkpoints=checkpoints, hyperparameters=DENSE | {"n_envs": n_envs}))
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(warnings) == n_warnings and all("truncate" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize(("steps", "compiled"), [(7_990, False), (8_010, True)])
+def test_short_runs_are_not_compiled(steps: int, compiled: bool) -> None:
+    assert (
+        Setup(make_run(checkpoints=(steps,), hyperparameters=DENSE | {"compile": True}), "here").settings["compile"]
+        is compiled
+    )
 
 
 def test_a_run_too_short_to_learn_is_said_before_it_starts(caplog: pytest.LogCaptureFixture) -> None:

@@ -53,6 +53,9 @@ EVALUATION_SEED = 10_000
 EVALUATION_SEEDS = 1_000_000
 # Evaluations are normalized with the statistics of training, and have the task's own rewards.
 FIXED = {"training": False, "norm_reward": False}
+# Agent steps of the shortest run that is compiled: compiling takes two minutes, and at best saves 15 ms of a gradient step (from
+# pixels, benchmarks/README.md).
+COMPILED_STEPS = 8_000
 # Hyper-parameters that do not change what is trained: the checkpoints say how long, and any device will do.
 FREE = ("n_timesteps", "device")
 
@@ -221,6 +224,8 @@ class Setup:
         if "buffer_size" in settings:
             # The same run with a smaller checkpoint; each environment has an equal share of the buffer.
             settings["buffer_size"] = min(settings["buffer_size"], math.ceil(self.agent_steps / self.n_envs) * self.n_envs)
+        if settings.get("compile") and self.agent_steps < COMPILED_STEPS:
+            settings["compile"] = False
         for key, value in settings.items():
             if key.endswith("learning_rate") and isinstance(value, str):
                 settings[key] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
