@@ -53,8 +53,8 @@ EVALUATION_SEED = 10_000
 EVALUATION_SEEDS = 1_000_000
 # Evaluations are normalized with the statistics of training, and have the task's own rewards.
 FIXED = {"training": False, "norm_reward": False}
-# Agent steps of the shortest run that is compiled: compiling takes two minutes, and at best saves 15 ms of a gradient step (from
-# pixels, benchmarks/README.md).
+# Agent steps of the shortest run that is compiled: it takes two minutes, and saves at most 15 ms of a gradient step, from
+# pixels (benchmarks/README.md).
 COMPILED_STEPS = 8_000
 # Hyper-parameters that do not change what is trained: the checkpoints say how long, and any device will do.
 FREE = ("n_timesteps", "device")
