@@ -240,6 +240,11 @@ BODIES: dict[str, dict[str, Any]] = {
         "aux_loss": None,
         "precision": "bf16",
     },
+    "default_simba_64_entropy_unnormalized_bf16": {
+        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 64, "normalize": False}),
+        "ent_coef": "auto_0.1",
+        "precision": "bf16",
+    },
     "default_simba_no_aux_bf16": {**policy(features_extractor_class="simba"), "aux_loss": None, "precision": "bf16"},
     "default_dense_mlp_bf16": {**policy(features_extractor_class="dense_mlp"), "precision": "bf16"},
 }
