@@ -213,7 +213,6 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba_two_steps": {"gradient_steps": 2},
     "simba_unnormalized": policy(features_extractor_kwargs={"normalize": False}),
     "simba_weight_decay": policy(optimizer_kwargs={"weight_decay": 0.01, "decoupled_weight_decay": True}),
-    "default_simba": policy(features_extractor_class="simba"),
     "default_simba_bf16": {**policy(features_extractor_class="simba"), "precision": "bf16"},
     "default_simba_entropy_bf16": {
         **policy(features_extractor_class="simba"),
@@ -245,7 +244,6 @@ BODIES: dict[str, dict[str, Any]] = {
         "ent_coef": "auto_0.1",
         "precision": "bf16",
     },
-    "default_simba_no_aux_bf16": {**policy(features_extractor_class="simba"), "aux_loss": None, "precision": "bf16"},
     "default_dense_mlp_bf16": {**policy(features_extractor_class="dense_mlp"), "precision": "bf16"},
 }
 
