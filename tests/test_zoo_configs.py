@@ -210,9 +210,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba_all": policy(net_arch=[128], network="simba"),
     "simba_critic_norm": policy(network={"pi": "mlp", "qf": "layer_norm"}),
     "simba_no_aux": {"aux_loss": None, "encoder_tau": None, "predictor_width": None},
-    "simba_two_steps": {"gradient_steps": 2},
     "simba_unnormalized": policy(features_extractor_kwargs={"normalize": False}),
-    "simba_weight_decay": policy(optimizer_kwargs={"weight_decay": 0.01, "decoupled_weight_decay": True}),
     "default_simba_bf16": {**policy(features_extractor_class="simba"), "precision": "bf16"},
     "default_simba_entropy_bf16": {
         **policy(features_extractor_class="simba"),
@@ -237,6 +235,21 @@ BODIES: dict[str, dict[str, Any]] = {
         **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 64}),
         "ent_coef": "auto_0.1",
         "aux_loss": None,
+        "precision": "bf16",
+    },
+    "default_simba_64_entropy_two_steps_bf16": {
+        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 64}),
+        "ent_coef": "auto_0.1",
+        "gradient_steps": 2,
+        "precision": "bf16",
+    },
+    "default_simba_64_entropy_weight_decay_bf16": {
+        **policy(
+            features_extractor_class="simba",
+            features_extractor_kwargs={"features_dim": 64},
+            optimizer_kwargs={"weight_decay": 0.01, "decoupled_weight_decay": True},
+        ),
+        "ent_coef": "auto_0.1",
         "precision": "bf16",
     },
     "default_simba_64_entropy_unnormalized_bf16": {
