@@ -18,7 +18,7 @@ from sb3_aarl.envs import env_ids, make_dmc_env
 from search.training.config import load_hyperparameters, merge
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
-FILES = sorted(path for folder in (ZOO, ZOO / "choices", ZOO / "body", ZOO / "defaults") for path in folder.glob("*.yml"))
+FILES = sorted(path for folder in ("", "choices", "body", "defaults", "simba") for path in (ZOO / folder).glob("*.yml"))
 
 # Table 4: 100K steps above, 1000K below.
 EASY = (
@@ -259,6 +259,12 @@ BODIES: dict[str, dict[str, Any]] = {
     },
     "default_dense_mlp_bf16": {**policy(features_extractor_class="dense_mlp"), "precision": "bf16"},
 }
+# The finalist of body/, and what it is compared with; they differ from SACAux's defaults.
+SIMBA: dict[str, dict[str, Any]] = {
+    "aarl_simba": BODIES["default_simba_64_entropy_bf16"],
+    "sac_simba": BODIES["default_simba_64_entropy_no_aux_bf16"],
+    "aarl_dense_mlp": {**BODIES["default_dense_mlp_bf16"], "ent_coef": "auto_0.1"},
+}
 
 
 def test_bodies_differ_in_nothing_else() -> None:
@@ -282,6 +288,18 @@ def test_bodies_differ_in_nothing_else() -> None:
             if env_id.startswith(("dm_control/walker", "dm_control/finger")):
                 wanted |= {"n_timesteps": 50_000, "env_kwargs": {"action_repeat": 2}}
             assert plain(load_hyperparameters(path, env_id)) == plain(wanted)
+
+
+def test_simba_differs_from_the_defaults_in_nothing_else() -> None:
+    defaults = load_hyperparameters(ZOO / "default.yml", "MyEnv-v0")
+    assert {path.stem for path in (ZOO / "simba").glob("*.yml")} == SIMBA.keys()
+    for name, changes in SIMBA.items():
+        path = ZOO / "simba" / f"{name}.yml"
+        for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
+            repeat = 2 if env_id.startswith(("dm_control/walker", "dm_control/finger")) else 4
+            steps = {"n_timesteps": 100_000 // repeat, "env_kwargs": {"action_repeat": repeat}}
+            assert load_hyperparameters(path, env_id) == {**defaults, **changes, **steps}
+        assert load_hyperparameters(path, "MyEnv-v0") == {**defaults, **changes}
 
 
 @functools.cache
