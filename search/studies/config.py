@@ -58,8 +58,8 @@ Checkpoints = Annotated[tuple[PositiveInt, ...], AfterValidator(_ascending)]
 
 class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     """
-    Cross-validation of the ``top`` candidates of a search (paper, A.4), with the environment steps of the evaluations on
-    environments that differ from the search's.
+    Cross-validation of the ``top`` candidates of a search (paper, A.4). ``checkpoints`` are the environment steps of the
+    evaluations on each environment, where they differ from the search's.
     """
 
     environments: Environments
@@ -211,7 +211,8 @@ def load_config(path: str | Path) -> SearchConfig:
         baselines = config.baselines if env_id == config.environment else ()
         for overrides in ({}, *(baseline.overrides for baseline in baselines)):
             interval = checkpoint_interval(config.hyperparameters_for(env_id, overrides))
-            between = [step for step in config.checkpoints_for(env_id) if step % interval]
+            longer = config.cross_validation.checkpoints.get(env_id, ()) if config.cross_validation else ()
+            between = [step for step in sorted({*config.checkpoints_for(env_id), *longer}) if step % interval]
             if between:
                 of_what = f"{interval} (train_freq x n_envs x action repeat of {env_id})"
                 raise ConfigError(f"{path}: checkpoints: must be multiples of {of_what}, {between} are not")

@@ -52,12 +52,12 @@ def make_matrix(
         )
     losses = top_losses(study, section.top if top is None else top)
     runs = {}
-    for seed, environment in product(section.seeds, section.environments):
-        for loss in losses:
-            runs[Cell(str(loss), environment, seed)] = make_run(config, environment, loss, seed)
-        for baseline in baselines:
-            run = make_run(config, environment, baseline.aux_loss, seed, baseline.overrides)
-            runs[Cell(baseline.name, environment, seed)] = run
+    candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
+    for seed, environment, variant in product(section.seeds, section.environments, [*candidates, *baselines]):
+        run = make_run(config, environment, variant.aux_loss, seed, variant.overrides)
+        # On the search's environment, runs may be longer than those of its candidates.
+        checkpoints = section.checkpoints.get(environment, config.checkpoints)
+        runs[Cell(variant.name, environment, seed)] = run.model_copy(update={"checkpoints": checkpoints})
     return Matrix(f"{study.study_name}-cross-validation", folder / "cross-validation", runs)
 
 
