@@ -7,7 +7,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_aarl.aux_loss import AuxLoss, Token
-from sb3_aarl.buffers import WindowSamples
+from sb3_aarl.buffers import WindowSamples, map_parts
 from sb3_aarl.operators import Operator
 
 
@@ -80,7 +80,8 @@ class AuxHead(nn.Module):
         parts = []
         n_states = len(offsets(tokens, "s"))
         if n_states:
-            latent = encode(_select(windows.observations, positions))
+            # One batch, in the order of memory.
+            latent = encode(map_parts(lambda part: part.transpose(0, 1)[positions].flatten(end_dim=1), windows.observations))
             parts.append(latent.unflatten(0, (n_states, batch)).transpose(0, 1).flatten(start_dim=1))
         # One by one: to index with a list, a GPU has to wait.
         parts += [windows.actions[:, offset] for offset in offsets(tokens, "a")]
@@ -91,10 +92,3 @@ class AuxHead(nn.Module):
 def offsets(tokens: Sequence[Token], kind: str) -> list[int]:
     """Offsets from the window's start of the tokens of one kind: ``s``, ``a`` or ``r``."""
     return [token.offset for token in tokens if token.kind == kind]
-
-
-def _select(observations: th.Tensor | dict[str, th.Tensor], positions: slice) -> PyTorchObs:
-    """Some positions in time of windows (batch, time, ...), as one batch (positions * batch, ...): the order in memory."""
-    if isinstance(observations, dict):
-        return {key: value.transpose(0, 1)[positions].flatten(end_dim=1) for key, value in observations.items()}
-    return observations.transpose(0, 1)[positions].flatten(end_dim=1)

@@ -49,7 +49,7 @@ class NoWindowError(ValueError):
     """No episode in the buffer is long enough for the horizon yet."""
 
 
-def _map(function: Callable[[Any], Any], observations: Any) -> Any:
+def map_parts(function: Callable[[Any], Any], observations: Any) -> Any:
     """The same function of observations, or of every part of Dict observations."""
     if isinstance(observations, dict):
         return {key: function(part) for key, part in observations.items()}
@@ -200,8 +200,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         }
         observations: Any = parts if isinstance(self.observation_space, spaces.Dict) else parts[""]
         if env is not None:
-            observations = env.normalize_obs(_map(lambda part: part.cpu().numpy(), observations))
-        return _map(th.as_tensor, observations)
+            observations = env.normalize_obs(map_parts(lambda part: part.cpu().numpy(), observations))
+        return map_parts(th.as_tensor, observations)
 
     def add(  # type: ignore[override]
         self,
@@ -349,9 +349,9 @@ class WindowReplayBuffer(NStepReplayBuffer):
         both = self.gather(batch_inds, envs, np.array([[False], [True]]), env, crop_size)
         dones = self.dones[batch_inds, envs] * (1 - self.timeouts[batch_inds, envs])
         return (DictReplayBufferSamples if isinstance(both, dict) else ReplayBufferSamples)(
-            _map(lambda part: part[0].to(self.device), both),
+            map_parts(lambda part: part[0].to(self.device), both),
             self.to_torch(self.actions[batch_inds, envs]),
-            _map(lambda part: part[1].to(self.device), both),
+            map_parts(lambda part: part[1].to(self.device), both),
             self.to_torch(dones[:, None]),
             self.to_torch(self._normalize_reward(self.rewards[batch_inds, envs][:, None], env)),
         )
@@ -412,7 +412,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         # Gathered one offset after the other, so that all observations at some of the offsets are contiguous.
         observations = self.gather(steps[:, wanted - following].T, envs, following[:, None], env, crop_size)
         return WindowSamples(
-            _map(lambda part: part.transpose(0, 1).to(self.device), observations),
+            map_parts(lambda part: part.transpose(0, 1).to(self.device), observations),
             self.to_torch(self.actions[steps, envs[:, None]]),
             self.to_torch(self._normalize_reward(self.rewards[steps, envs[:, None], None], env)),
         )

@@ -5,11 +5,12 @@ from collections.abc import Mapping
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 
+from sb3_aarl.augmentation import image_spaces
 from sb3_aarl.networks import SimbaBlock, orthogonal_init
 
 
@@ -228,14 +229,9 @@ class MultiInputEncoder(Encoder):
         normalized_image: bool = False,
         vector_encoder: str = "dense_mlp",
     ):
-        images: dict[str, spaces.Space] = {}
-        vectors: dict[str, spaces.Space] = {}
-        for key, space in observation_space.spaces.items():
-            is_image = is_image_space(space, normalized_image=normalized_image)
-            (images if is_image else vectors)[key] = space
-        encoders: dict[str, Encoder] = {
-            key: PixelEncoder(space, cnn_output_dim) for key, space in images.items() if isinstance(space, spaces.Box)
-        }
+        images = image_spaces(observation_space, normalized_image)
+        vectors = {key: space for key, space in observation_space.spaces.items() if key not in images}
+        encoders: dict[str, Encoder] = {key: PixelEncoder(space, cnn_output_dim) for key, space in images.items()}
         if vectors:
             encoders["vectors"] = VECTOR_ENCODERS[vector_encoder](spaces.Dict(vectors), mlp_output_dim)
         super().__init__(

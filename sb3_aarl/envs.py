@@ -17,6 +17,7 @@ from gymnasium.wrappers import (
     AddRenderObservation,
     FlattenObservation,
     FrameStackObservation,
+    RepeatAction,
     ReshapeObservation,
     TimeLimit,
     TransformAction,
@@ -50,28 +51,6 @@ NEEDS_DMC = (
 EPISODE_LENGTH = 1000
 # The camera that papers render a domain with, where it is not the first one (CURL, DrQ-v2: behind the quadruped).
 CAMERAS = {"quadruped": 2}
-
-
-class RepeatAction(gym.Wrapper):
-    """
-    Keep each action for several steps and sum their rewards. Gymnasium has the same from 1.3 on, which SB3 2.8 forbids.
-
-    :param env: The environment
-    :param num_repeats: Steps for which an action is kept; fewer where the episode ends
-    """
-
-    def __init__(self, env: gym.Env, num_repeats: int):
-        super().__init__(env)
-        self.num_repeats = num_repeats
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        total = 0.0
-        for _ in range(self.num_repeats):
-            observation, reward, terminated, truncated, info = self.env.step(action)
-            total += float(reward)
-            if terminated or truncated:
-                break
-        return observation, total, terminated, truncated, info
 
 
 @functools.cache

@@ -67,6 +67,3 @@ class Operator(nn.Module):
         if self.name == "bilinear":
             prediction = prediction @ self.weight
         return cross_entropy(prediction @ target.T, self.negatives)
-
-    def extra_repr(self) -> str:
-        return f"{self.name}, negatives={self.negatives}"

@@ -17,6 +17,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
 from stable_baselines3.her import HerReplayBuffer
@@ -312,7 +313,7 @@ class SACAux(SAC):
         self.aux_head = AuxHead(
             self.aux_loss,
             self.critic.features_extractor.features_dim,
-            self._action_dim,
+            get_action_dim(self.action_space),
             self.predictor_width,
             self.predictor_batch_norm,
         ).to(self.device)
@@ -334,24 +335,15 @@ class SACAux(SAC):
             # The random numbers are PyTorch's own.
             setattr(self, name, th.compile(getattr(self, name), options={"fallback_random": True}))
 
-    @property
-    def _action_dim(self) -> int:
-        assert self.action_space.shape is not None
-        return int(np.prod(self.action_space.shape))
-
     def _schedule(self, learning_rate: float | Schedule | None) -> Schedule:
         return self.lr_schedule if learning_rate is None else FloatSchedule(learning_rate)
 
     def _update_learning_rates(self) -> None:
-        progress = self._current_progress_remaining
-        self.logger.record("train/learning_rate", self.lr_schedule(progress))
-        schedules = {self.actor.optimizer: self.lr_schedule, self.critic.optimizer: self.lr_schedule}
-        if self.ent_coef_optimizer is not None:
-            schedules[self.ent_coef_optimizer] = self._schedule(self.ent_coef_learning_rate)
-        if self.aux_optimizer is not None:
-            schedules[self.aux_optimizer] = self._schedule(self.encoder_learning_rate)
-        for optimizer, schedule in schedules.items():
-            update_learning_rate(optimizer, schedule(progress))
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        others = (self.ent_coef_optimizer, self.ent_coef_learning_rate), (self.aux_optimizer, self.encoder_learning_rate)
+        for optimizer, learning_rate in others:
+            if optimizer is not None:
+                update_learning_rate(optimizer, self._schedule(learning_rate)(self._current_progress_remaining))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Batch norm and dropout of the networks that learn; the target critic stays in evaluation mode.
@@ -529,7 +521,7 @@ class SACAux(SAC):
             if name != "largest_reward":
                 self.logger.record(f"train/{name}", sum(values.values()) / len(values))
         if losses:
-            self._q_value_check(losses, self.gamma, self._action_dim, self._describe)
+            self._q_value_check(losses, self.gamma, get_action_dim(self.action_space), self._describe)
 
     def _describe(self, gradient_step: int) -> str:
         return f"gradient step {gradient_step}, agent step {self.num_timesteps}; auxiliary loss: {self.aux_loss}"
