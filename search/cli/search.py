@@ -1,7 +1,7 @@
 """The command ``aarl search``: it wires configuration, storage, sampler, executor, driver and notes."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -85,10 +85,11 @@ def search(
     progresses: Any = iter(
         Driver(study, opened, runs_of(settings), running, path, at_once, settings.retries, on_change=annotate)
     )
-    with running, closing(progresses):
-        shown = show_progress(progresses)
+    with running, closing(progresses), live() as show:
+        for shown in progresses:
+            show(progress_line(shown), shown.generations)
     update_plots(study, stored_baselines(path))
-    if shown is not None and shown.best is not None:
+    if shown.best is not None:
         say(f"Best: {shown.best_loss}, score {shown.best:.2f}")
 
 
@@ -110,15 +111,6 @@ def annotations(study: "Study", config: "SearchConfig", folder: Path) -> "Callab
             update_plots(study, stored_baselines(folder))
 
     return annotate
-
-
-def show_progress(progresses: "Iterable[SearchProgress]") -> "SearchProgress | None":
-    """Show the progress of a search until it ends, and return the last one."""
-    shown = None
-    with live() as show:
-        for shown in progresses:
-            show(progress_line(shown), shown.generations)
-    return shown
 
 
 def progress_line(progress: "SearchProgress") -> str:

@@ -1,13 +1,13 @@
 """Runs on a Ray cluster, whose nodes share the folder of the search (extra ``ray``)."""
 
 from collections.abc import Callable
-from types import TracebackType
+from contextlib import AbstractContextManager
 from typing import Any
 
 import ray
 
 
-class RayExecutor:
+class RayExecutor(AbstractContextManager["RayExecutor"]):
     """
     Runs as tasks of Ray. It queues what does not fit yet, so that autoscalers see the demand.
 
@@ -31,10 +31,7 @@ class RayExecutor:
         self._references.append(reference)
         return reference.future()
 
-    def __enter__(self) -> "RayExecutor":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(self, *exception: Any) -> None:
         for reference in self._references:
             ray.cancel(reference, force=True)  # one that is over stays as it is
         ray.shutdown()

@@ -16,7 +16,7 @@ from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from search.evolution.space import loss_of, loss_to_params
 from search.results.rankings import rank_agreement, rankings
-from search.results.trials import curve_of, lineage, ranked, score_of
+from search.results.trials import lineage, ranked, score_of
 
 # Section 3.3, in the order of table 5.
 PATTERNS: Mapping[str, str | AuxLoss] = {
@@ -65,7 +65,7 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
             "score": np.nan if score is None else score,
             "loss": loss,
             "canonical": None if loss is None else loss.canonical(),
-            "curve": curve_of(trial),
+            "curve": trial.user_attrs.get("curve", []),
         }
         rows.append(row | {key: getattr(loss, key, None) for key in ("horizon", "operator", "negatives")})
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)

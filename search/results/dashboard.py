@@ -14,7 +14,7 @@ from sb3_aarl.aux_loss import AuxLoss
 from search.evolution.space import loss_of
 from search.results.analysis import trial_table
 from search.results.plots import evolution_figure
-from search.results.trials import curve_of, lineage, score_of
+from search.results.trials import lineage, score_of
 
 PLOT_ID = "evolution"
 # Notes are attributes of the study, of which every page of the dashboard reads all.
@@ -49,7 +49,7 @@ def annotate_trial(study: Study, trial: Trial) -> None:
     frozen = trials[trial.number]
     # Until all seeds are finished there is what was reported to Optuna, which has no deviations.
     reported = [(step, mean, math.nan) for step, mean in sorted(frozen.intermediate_values.items())]
-    loss, curve = loss_of(frozen), curve_of(frozen) or reported
+    loss, curve = loss_of(frozen), frozen.user_attrs.get("curve") or reported
     note = [*_loss_lines(frozen, loss), _origin(frozen)]
     if "reason" in frozen.user_attrs:
         note.append(f"**Reason of the failure:** {_escape(frozen.user_attrs['reason'])}")

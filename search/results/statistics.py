@@ -33,7 +33,8 @@ def interquartile_means(runs: pd.DataFrame) -> pd.DataFrame:
         one run only), the runs ``left_out``, and names of the tasks ``skipped``
     """
     rows = []
-    for (checkpoint, tasks), scale in runs.groupby(["checkpoint", _scale(runs)], sort=False):
+    scales = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
+    for (checkpoint, tasks), scale in runs.groupby(["checkpoint", scales], sort=False):
         present = scale.dropna(subset="mean")
         is_common = present.groupby("environment")["variant"].nunique() == present["variant"].nunique()
         common = list(is_common.index[is_common])
@@ -69,11 +70,6 @@ def improvements(runs: pd.DataFrame) -> pd.DataFrame:
                 interval = _interval(samples, _improvement)
                 rows.append((checkpoint, variant, over, len(common), _improvement(*samples), *interval))
     return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high"])
-
-
-def _scale(runs: pd.DataFrame) -> pd.Series:
-    """The tasks whose returns can be averaged: those of DeepMind Control together, each other one by itself."""
-    return runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
 
 
 def _iqm(*samples: np.ndarray, axis: int = -1) -> Any:

@@ -25,7 +25,7 @@ STANDARD_ERRORS = 2.0
 MARKS = {"higher": "▲", "lower": "▼", "": ""}
 # The row of table 6, which has no environments.
 NORMALIZED = "normalized"
-# Suffix of a variant whose networks compute in bfloat16.
+# Suffix of a variant whose networks compute in bfloat16: the paper's all the same.
 BF16 = "_bf16"
 RUN_COLUMNS = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions", "program", "episodes"]
 PAPER_COLUMNS = ["checkpoint", "environment", "column", "variant", "mean", "std", "runs"]
@@ -53,14 +53,9 @@ def paper_scores(number: int | None) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=PAPER_COLUMNS)
 
 
-def _paper_variant(variant: str) -> str:
-    """The paper's variant that one is: computed in bfloat16 it is the same one."""
-    return variant.removesuffix(BF16)
-
-
 def closest_table(variants: Iterable[str]) -> int | None:
     """The paper's table with the most of some variants, None if none has any."""
-    names = set(map(_paper_variant, variants))
+    names = {variant.removesuffix(BF16) for variant in variants}
     matches = {number: len(names & set(table["columns"].values())) for number, table in _paper().items()}
     best = max(matches, key=lambda number: matches[number])
     return best if matches[best] else None
@@ -136,7 +131,7 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     headings = dict(zip(paper["variant"], paper["column"], strict=True))
     paper = paper.rename(columns={"variant": "paper_variant", "mean": numbers[0], "std": numbers[1], "runs": numbers[2]})
     paper = paper.drop(columns="column").astype(dict.fromkeys(numbers, float))
-    result["paper_variant"] = result["variant"].map(_paper_variant)
+    result["paper_variant"] = result["variant"].str.removesuffix(BF16)
     names = zip(result["paper_variant"], result["variant"], strict=True)
     result["column"] = [headings.get(name, variant) for name, variant in names]
     result = result.merge(paper, on=[*keys[:2], "paper_variant"], how="left")
@@ -154,7 +149,7 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
 def _is_comparable(comparison: pd.DataFrame) -> bool:
     """Whether the scores of a checkpoint can be compared with the paper's: not if they are normalized by other variants."""
     is_normalized = (comparison["environment"] == NORMALIZED).any()
-    variants = sorted(map(_paper_variant, comparison.dropna(subset="mean")["variant"]))
+    variants = sorted(comparison.dropna(subset="mean")["variant"].str.removesuffix(BF16))
     return not is_normalized or variants == sorted(_paper()[6]["columns"].values())
 
 

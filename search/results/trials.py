@@ -7,13 +7,6 @@ from optuna import Trial
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-Curve = list[tuple[int, float, float]]
-
-
-def curve_of(trial: FrozenTrial | Trial) -> Curve:
-    """The learning curve of a trial as (environment steps, mean, standard deviation); empty if there is none."""
-    return [(int(steps), float(mean), float(std)) for steps, mean, std in trial.user_attrs.get("curve", ())]
-
 
 def score_of(trial: FrozenTrial) -> float | None:
     """The score of a completed trial; None for all others, and where it is not finite."""
