@@ -27,7 +27,7 @@ PUBLISHED = {
 def main() -> None:
     curves = pd.concat(read_curves(RESULTS / folder) for folder in FOLDERS)
     curves = curves[curves["variant"].isin(VARIANTS) & curves["env"].isin(PUBLISHED)]
-    curves["variant"] = pd.Categorical(curves["variant"].map(VARIANTS), VARIANTS.values())
+    curves["variant"] = pd.Categorical(curves["variant"].map(VARIANTS), list(VARIANTS.values()))
     figure = learning_curves_plot(curves.sort_values(["env", "variant"]))
     for axes in figure.axes:
         returns = PUBLISHED[axes.get_title().partition("\n")[0]]
