@@ -210,10 +210,12 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba_all": policy(net_arch=[128], network="simba"),
     "simba_critic_norm": policy(network={"pi": "mlp", "qf": "layer_norm"}),
     "simba_no_aux": {"aux_loss": None, "encoder_tau": None, "predictor_width": None},
-    "simba_unnormalized": policy(features_extractor_kwargs={"normalize": False}),
-    "default_simba_bf16": {**policy(features_extractor_class="simba"), "precision": "bf16"},
+    "default_simba_bf16": {
+        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 128}),
+        "precision": "bf16",
+    },
     "default_simba_entropy_bf16": {
-        **policy(features_extractor_class="simba"),
+        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 128}),
         "ent_coef": "auto_0.1",
         "precision": "bf16",
     },
@@ -259,11 +261,21 @@ BODIES: dict[str, dict[str, Any]] = {
     },
     "default_dense_mlp_bf16": {**policy(features_extractor_class="dense_mlp"), "precision": "bf16"},
 }
-# The finalist of body/, and what it is compared with; they differ from SACAux's defaults.
+# The finalist of body/, its parts, and what it is compared with; they differ from SACAux's defaults.
+AARL_SIMBA = BODIES["default_simba_64_entropy_bf16"]
+DENSE_MLP = {**BODIES["default_dense_mlp_bf16"], "ent_coef": "auto_0.1"}
 SIMBA: dict[str, dict[str, Any]] = {
-    "aarl_simba": BODIES["default_simba_64_entropy_bf16"],
+    "aarl_simba": AARL_SIMBA,
     "sac_simba": BODIES["default_simba_64_entropy_no_aux_bf16"],
-    "aarl_dense_mlp": {**BODIES["default_dense_mlp_bf16"], "ent_coef": "auto_0.1"},
+    "aarl_dense_mlp": DENSE_MLP,
+    "dense_mlp_alone": {**DENSE_MLP, "aux_loss": None},
+    "aarl_dense_mlp_heads": merge(DENSE_MLP, policy(net_arch=[128], network="simba")),
+    "aarl_dense_mlp_normalized": {**DENSE_MLP, "normalize": {"norm_reward": False}},
+    "aarl_simba_heads": merge(AARL_SIMBA, policy(net_arch=[128], network="simba")),
+    "aarl_simba_critic_norm": merge(AARL_SIMBA, policy(network={"pi": "mlp", "qf": "layer_norm"})),
+    "aarl_simba_unnormalized": BODIES["default_simba_64_entropy_unnormalized_bf16"],
+    "aarl_simba_two_steps": {**AARL_SIMBA, "gradient_steps": 2},
+    "aarl_simba_weight_decay": BODIES["default_simba_64_entropy_weight_decay_bf16"],
 }
 
 
@@ -280,7 +292,10 @@ def test_bodies_differ_in_nothing_else() -> None:
         for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
             wanted = merge(load_hyperparameters(ZOO / "aarl_state.yml", "dm_control/hopper-stand-v0"), SMALL)
             if name.startswith("simba"):
-                wanted["policy_kwargs"] |= {"features_extractor_class": "simba", "features_extractor_kwargs": None}
+                wanted["policy_kwargs"] |= {
+                    "features_extractor_class": "simba",
+                    "features_extractor_kwargs": {"features_dim": 128},
+                }
             wanted = merge(wanted, {"learning_rate": 3e-4, **changes})
             if name.startswith("default_"):
                 wanted = {**load_hyperparameters(ZOO / "default.yml", env_id), **changes, "n_timesteps": 25_000}
