@@ -46,7 +46,13 @@ class Own(gym.Env):
         return self.np_random.integers(0, 256, (32, 32, 3), np.uint8)
 
 
+class Unseen(Own):
+    def __init__(self):
+        pass
+
+
 gym.register("Own-v0", Own, max_episode_steps=20)
+gym.register("Unseen-v0", Unseen, max_episode_steps=20)
 """
 
 
@@ -243,6 +249,7 @@ def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
     (trained / "model.zip").rename("alone.zip")
     assert "which environment?" in run("evaluate", "alone.zip", code=2)
     assert "spaces do not match" in run("evaluate", "alone.zip", "Pendulum-v1", code=2)
+    assert "Unseen-v0 cannot be made" in run("video", "alone.zip", "Unseen-v0", code=2)
     assert "no_env cannot be imported" in run("evaluate", "alone.zip", "Own-v0", "--imports", "no_env", code=2)
     assert "model.zip does not exist" in run("video", trained, code=2)
 

@@ -154,6 +154,8 @@ def cross_validate(
         winner = cross_validation.write_winner(candidates, path / "winner.yml")
         if not json:
             say(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}")
+            if table.index[0] in names:
+                say(f"No candidate is as good as {table.index[0]}.")
     exit_if_failed(matrix)
 
 

@@ -91,6 +91,8 @@ def search(
     update_plots(study, stored_baselines(path))
     if shown.best is not None:
         say(f"Best: {shown.best_loss}, score {shown.best:.2f}")
+        if settings.cross_validation:
+            say(f"Does it hold with other seeds? aarl cross-validate {config}")
 
 
 def annotations(study: "Study", config: "SearchConfig", folder: Path) -> "Callable[[Trial], None]":

@@ -159,7 +159,7 @@ def video(
         Path | None, typer.Option(help=".gif, or .mp4 (pip install imageio-ffmpeg). Default: video.gif beside the model.")
     ] = None,
 ) -> None:
-    """Film a trained model."""
+    """Film a trained model, whose environment takes render_mode."""
     import imageio.v3 as imageio
 
     path = out or (model if model.is_dir() else model.parent) / "video.gif"

@@ -83,6 +83,6 @@ def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
     """
     winner = AuxLoss.parse(str(table.index[0]))
     mean, runs = table["mean"].iloc[0], table["runs"].iloc[0]
-    comment = f"# Best of {len(table)} candidates in cross-validation: mean score {mean:.3f} of {runs} runs\n"
+    comment = f"# Best of {len(table)} candidates in cross-validation: mean score {mean:.3f}, runs: {runs}\n"
     replace_text(path, comment + yaml.safe_dump({"aux_loss": winner}, sort_keys=False))
     return winner

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 import pydantic
 import torch as th
 from filelock import FileLock, Timeout
@@ -258,14 +259,16 @@ class Setup:
 
 def check_run(run: Run) -> None:
     """
-    Make environment and model of a run once, and warn of what a user may not have meant.
+    Make environment and model of a run once, and make a step; warn of what a user may not have meant.
 
-    :raises ConfigError: in one line, when they cannot be made of its settings
+    :raises ConfigError: in one line, when that fails
     """
     try:
         setup = Setup(run, run.environment)
         with closing_env(setup.training_env()) as env:
             learning_starts = setup.model(env).learning_starts
+            env.reset()
+            env.step(np.stack([env.action_space.sample() for _ in range(env.num_envs)]))
     except ConfigError:
         raise
     except Exception as error:  # Gymnasium, SB3 and PyTorch have errors of all kinds
