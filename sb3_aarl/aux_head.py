@@ -76,13 +76,12 @@ class AuxHead(nn.Module):
         encode: Callable[[PyTorchObs], th.Tensor],
     ) -> th.Tensor:
         """Latent states, actions and rewards of the tokens side by side, (batch, d); all states in one encoder pass."""
-        batch = len(windows.actions)
-        parts = []
+        parts: list[th.Tensor] = []
         n_states = len(offsets(tokens, "s"))
         if n_states:
             # One batch, in the order of memory.
             latent = encode(map_parts(lambda part: part.transpose(0, 1)[positions].flatten(end_dim=1), windows.observations))
-            parts.append(latent.unflatten(0, (n_states, batch)).transpose(0, 1).flatten(start_dim=1))
+            parts += latent.chunk(n_states)
         # One by one: to index with a list, a GPU has to wait.
         parts += [windows.actions[:, offset] for offset in offsets(tokens, "a")]
         parts += [windows.rewards[:, offset] for offset in offsets(tokens, "r")]

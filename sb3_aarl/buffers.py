@@ -70,7 +70,7 @@ class _Observations:
             return self[:][index]
         grid = np.broadcast_arrays(*np.ogrid[: self.buffer.buffer_size, : self.buffer.n_envs])
         positions, envs = (np.asarray(part[index[:2]]) for part in grid)
-        observations = self.buffer.gather(positions, envs, self.following)
+        observations = self.buffer.gather(positions * self.buffer.n_envs + envs, self.following)
         part = observations[self.key] if isinstance(observations, dict) else observations
         return part.cpu().numpy()[(*(slice(None),) * positions.ndim, *index[2:])]
 
@@ -173,8 +173,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
 
     def gather(
         self,
-        positions: np.ndarray,
-        envs: np.ndarray,
+        indices: np.ndarray,
         following: bool | np.ndarray = False,
         env: VecNormalize | None = None,
         crop_size: int | None = None,
@@ -182,15 +181,14 @@ class WindowReplayBuffer(NStepReplayBuffer):
         """
         Observations.
 
-        :param positions: Positions in the buffer; like envs not checked
-        :param envs: Envs, one for each position, or of a shape that broadcasts to theirs
-        :param following: Whether to return the next observation instead; (...) is what it and positions broadcast to
+        :param indices: Flat indices in (buffer_size, n_envs), not checked
+        :param following: Whether to return the next observation instead; (...) is what it and indices broadcast to
         :param env: VecNormalize, which normalizes whole images: they are not cropped
         :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
         :return: (..., *observation shape) where they are stored, height and width those of the crop; a dict for Dict
             observations
         """
-        indices = positions * self.n_envs + envs
+        positions = indices // self.n_envs
         # Positions before self.pos were written in this round of the ring, the others in the round before.
         numbers = self.n_added - self.pos + positions - np.where(positions < self.pos, 0, self.buffer_size)
         ages, final = self.ages.take(indices) + following, self.ended.take(indices) & following
@@ -344,20 +342,25 @@ class WindowReplayBuffer(NStepReplayBuffer):
         if self.n_steps > 1:
             # SB3's own code, which reads ``observations`` and ``next_observations``.
             return super()._get_samples(batch_inds, env)
-        envs = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        indices = batch_inds * self.n_envs + np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
         # Observations and next ones together.
-        both = self.gather(batch_inds, envs, np.array([[False], [True]]), env, crop_size)
-        dones = self.dones[batch_inds, envs] * (1 - self.timeouts[batch_inds, envs])
+        both = self.gather(indices, np.array([[False], [True]]), env, crop_size)
+        dones = self._take("dones", indices) * (1 - self._take("timeouts", indices))
         return (DictReplayBufferSamples if isinstance(both, dict) else ReplayBufferSamples)(
             map_parts(lambda part: part[0].to(self.device), both),
-            self.to_torch(self.actions[batch_inds, envs]),
+            self.to_torch(self._take("actions", indices), copy=False),
             map_parts(lambda part: part[1].to(self.device), both),
-            self.to_torch(dones[:, None]),
-            self.to_torch(self._normalize_reward(self.rewards[batch_inds, envs][:, None], env)),
+            self.to_torch(dones[:, None], copy=False),
+            self.to_torch(self._normalize_reward(self._take("rewards", indices)[:, None], env), copy=False),
         )
 
-    def _draw_windows(self, batch_size: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        """Positions of the last steps, and envs, of windows, uniform over all whole ones."""
+    def _take(self, name: str, indices: np.ndarray) -> np.ndarray:
+        """A copy of some rows of an array (buffer_size, n_envs, ...), by flat indices."""
+        array: np.ndarray = getattr(self, name)
+        return array.reshape(-1, *array.shape[2:]).take(indices, axis=0)
+
+    def _draw_windows(self, batch_size: int, horizon: int) -> np.ndarray:
+        """Flat indices of the last steps of windows, uniform over all whole ones."""
         n_steps = self.size() * self.n_envs
         # A step that has horizon - 1 steps of its episode before it ends a whole window, if they are all still there. Most
         # steps do; those that do not are drawn again, without a look at all the others.
@@ -378,8 +381,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
             if not len(every):
                 raise NoWindowError(f"no episode in the replay buffer spans {horizon} agent steps yet")
             ends = every[np.random.randint(len(every), size=batch_size)]
-        positions, envs = np.divmod(ends, self.n_envs)
-        return positions, envs
+        return ends
 
     def sample_windows(
         self,
@@ -405,14 +407,14 @@ class WindowReplayBuffer(NStepReplayBuffer):
         wanted = np.arange(horizon + 1) if offsets is None else np.asarray(offsets, np.int64)
         if ((wanted < 0) | (wanted > horizon)).any():
             raise ValueError(f"offsets {wanted.tolist()} of a window of horizon {horizon} are not all in 0 to {horizon}")
-        ends, envs = self._draw_windows(batch_size, horizon)
-        steps = (ends[:, None] + np.arange(1 - horizon, 1)) % self.buffer_size
+        ends = self._draw_windows(batch_size, horizon)
+        steps = (ends[:, None] + np.arange(1 - horizon, 1) * self.n_envs) % self.ages.size
         # The last observation is the next one of the last step: the episode may have ended there.
         following = wanted == horizon
         # Gathered one offset after the other, so that all observations at some of the offsets are contiguous.
-        observations = self.gather(steps[:, wanted - following].T, envs, following[:, None], env, crop_size)
+        observations = self.gather(steps[:, wanted - following].T, following[:, None], env, crop_size)
         return WindowSamples(
             map_parts(lambda part: part.transpose(0, 1).to(self.device), observations),
-            self.to_torch(self.actions[steps, envs[:, None]]),
-            self.to_torch(self._normalize_reward(self.rewards[steps, envs[:, None], None], env)),
+            self.to_torch(self._take("actions", steps), copy=False),
+            self.to_torch(self._normalize_reward(self._take("rewards", steps)[..., None], env), copy=False),
         )

@@ -230,9 +230,15 @@ class Critic(_CropsImages, ContinuousCritic):
         inputs = th.cat([latent, actions], dim=1)
         return tuple(full_precision(q_network(inputs)) for q_network in self.q_networks)
 
+    @cached_property
     def q_parameters(self) -> list[nn.Parameter]:
-        """All parameters but those of the encoder."""
+        """All parameters but those of the encoder, collected once."""
         return [parameter for network in self.q_networks for parameter in network.parameters()]
+
+    @cached_property
+    def encoder_parameters(self) -> list[nn.Parameter]:
+        """The parameters of the encoder, collected once."""
+        return list(self.features_extractor.parameters())
 
 
 class SACAuxPolicy(SACPolicy):

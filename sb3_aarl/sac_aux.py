@@ -320,7 +320,7 @@ class SACAux(SAC):
         schedule = self._schedule(self.encoder_learning_rate)
         self.aux_optimizer = self.policy.make_optimizer([*encoder, *self.aux_head.parameters()], schedule)
         if self.joint_optimizer:
-            self.critic.optimizer = self.policy.make_optimizer(self.critic.q_parameters(), self.lr_schedule)
+            self.critic.optimizer = self.policy.make_optimizer(self.critic.q_parameters, self.lr_schedule)
 
     def _compile_losses(self) -> None:
         try:
@@ -493,9 +493,8 @@ class SACAux(SAC):
     def _update_target(self) -> None:
         # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.
         if self.tau > 0:
-            polyak_update(self.critic.q_parameters(), self.critic_target.q_parameters(), self.tau)
-            encoder, momentum_encoder = self.critic.features_extractor, self.critic_target.features_extractor
-            polyak_update(encoder.parameters(), momentum_encoder.parameters(), self.encoder_tau)
+            polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
+            polyak_update(self.critic.encoder_parameters, self.critic_target.encoder_parameters, self.encoder_tau)
 
     @contextmanager
     def _logged(self) -> Iterator[Callable[[str, th.Tensor], None]]:

@@ -81,7 +81,7 @@ def networks(model: SACAux) -> dict[str, list[nn.Parameter]]:
     """The parameters by what has to train them."""
     return {
         "encoder": list(model.critic.features_extractor.parameters()),
-        "q": model.critic.q_parameters(),
+        "q": model.critic.q_parameters,
         "actor": model.actor.own_parameters(),
         "head": [] if model.aux_head is None else list(model.aux_head.parameters()),
         "momentum encoder": list(model.critic_target.features_extractor.parameters()),

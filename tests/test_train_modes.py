@@ -75,7 +75,7 @@ def test_bfloat16_computes_almost_the_same_gradients(kind: str) -> None:
         model.train(1, batch_size=128)
         trained = {
             "encoder": model.critic.features_extractor.parameters(),
-            "q": model.critic.q_parameters(),
+            "q": model.critic.q_parameters,
             "actor": model.actor.own_parameters(),
             "head": model.aux_head.parameters(),
         }
