@@ -318,6 +318,14 @@ def test_every_task_weighs_the_same_in_an_interquartile_mean(tmp_path: Path) -> 
     assert "leave out the seeds that a variant has on some of the tasks only" in shown
 
 
+def test_many_variants_go_down_the_rows(tmp_path: Path) -> None:
+    scores = {(f"variant {i}", task): np.array([i, i + 1.0]) for i in range(table.MANY + 1) for task in (CHEETAH, WALKER)}
+    plant_scores(tmp_path, scores)
+    shown = printed(tmp_path)
+    assert all(f"│ variant {i} │ {i} ± 1 │ {i} ± 1 │" in shown for i in range(0, table.MANY + 1, 2))
+    assert "Probability that" not in shown and "between more than 6 variants: --json" in shown
+
+
 @pytest.mark.parametrize(("of_other", "says"), [([1.0, 2.0], True), ([1.0, 4.0], False), ([3.0, 5.0], False)])
 def test_intervals_without_width_are_explained(tmp_path: Path, of_other: list[float], says: bool) -> None:
     plant_scores(tmp_path, {("mine", CHEETAH): np.array([3.0, 5.0]), ("other", CHEETAH): np.array(of_other)})

@@ -25,6 +25,8 @@ STANDARD_ERRORS = 2.0
 MARKS = {"higher": "▲", "lower": "▼", "": ""}
 # The row of table 6, which has no environments.
 NORMALIZED = "normalized"
+# With more variants than that they go down the rows, and their pairs are left to --json.
+MANY = 6
 # Suffix of a variant whose networks compute in bfloat16: the paper's all the same.
 BF16 = "_bf16"
 RUN_COLUMNS = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions", "program", "episodes"]
@@ -220,26 +222,33 @@ def terminal_tables(tables: Tables) -> list[Table]:
 
 
 def _score_tables(comparison: pd.DataFrame) -> list[Table]:
-    """For each checkpoint tasks as rows, variants as columns, the paper's score beside each."""
+    """For each checkpoint tasks and variants, the fewer as columns, the paper's score beside each."""
     tables = []
     for checkpoint, part in comparison.groupby("checkpoint"):
         problem = "" if _is_comparable(part) else ", without the paper's: normalized by other variants than its four"
         table = Table("", title=f"{_steps(checkpoint)} steps scores{problem}")
-        headings = dict(zip(part["variant"], part["column"], strict=True))
-        in_paper = set(part.dropna(subset="paper_mean")["variant"])
-        for variant, heading in headings.items():
-            table.add_column(escape(variant if heading == variant else f"{heading}\n{variant}"), justify="right")
-            if variant in in_paper:
+        variant_names = [
+            (variant, variant if heading == variant else f"{heading}\n{variant}")
+            for variant, heading in dict(zip(part["variant"], part["column"], strict=True)).items()
+        ]
+        task_names = [(environment, task_name(str(environment))) for environment in part["environment"].unique()]
+        key, rows, other, columns = "environment", task_names, "variant", variant_names
+        if len(columns) > max(MANY, len(rows)):
+            key, rows, other, columns = other, columns, key, rows
+        in_paper = set(part.dropna(subset="paper_mean")[other])
+        for name, heading in columns:
+            table.add_column(escape(heading), justify="right")
+            if name in in_paper:
                 table.add_column("paper", justify="right", style="dim")
-        for environment, group in part.groupby("environment", sort=False):
-            rows = {row["variant"]: row for row in group.to_dict("records")}
+        scores = {(row[key], row[other]): row for row in part.to_dict("records")}
+        for name, heading in rows:
             cells = []
-            for variant in headings:
-                row = rows.get(variant)
+            for column, _ in columns:
+                row = scores.get((name, column))
                 cells.append("" if row is None else _own_score(row))
-                if variant in in_paper:
+                if column in in_paper:
                     cells.append("" if row is None else _score(row["environment"], row["paper_mean"], row["paper_std"]))
-            table.add_row(task_name(str(environment)), *cells)
+            table.add_row(escape(heading), *cells)
         tables.append(table)
     return tables
 
@@ -254,7 +263,7 @@ def _statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
             interval = _range(row["low"], row["high"], ".1f")
             table.add_row(scale, escape(row["variant"]), mean, interval, f"{row['runs']}/{row['planned']}")
         tables.append(table)
-    for checkpoint, part in better.groupby("checkpoint"):
+    for checkpoint, part in _few(better).groupby("checkpoint"):
         title = f"Probability that a run of the row is better than one of the column, at {_steps(checkpoint)}"
         cells = part["probability"].map("{:.2f} ".format) + [
             _range(low, high, ".2f") for low, high in zip(part["low"], part["high"], strict=True)
@@ -268,9 +277,15 @@ def _statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
     return tables
 
 
+def _few(better: pd.DataFrame) -> pd.DataFrame:
+    """The probabilities at checkpoints that have few variants: a table of all pairs fits a page."""
+    return better[better.groupby("checkpoint")["variant"].transform("nunique") <= MANY]
+
+
 def footnotes(tables: Tables) -> list[str]:
     """How to read :func:`terminal_tables`, as far as something in them has to be explained."""
-    number, _, comparison, iqm, better = tables
+    number, _, comparison, iqm, every = tables
+    better = _few(every)
     lines = []
     if (iqm["runs"] < 4).any():
         lines.append(
@@ -281,6 +296,8 @@ def footnotes(tables: Tables) -> list[str]:
         lines.append("Interquartile means leave out the seeds that a variant has on some of the tasks only.")
     for (checkpoint, tasks), _ in iqm[iqm["skipped"] != ""].groupby(["checkpoint", "skipped"]):
         lines.append(f"At {_steps(checkpoint)} not every variant has runs on {tasks}: interquartile means leave that out.")
+    if len(better) < len(every):
+        lines.append(f"Probabilities of improvement between more than {MANY} variants: --json.")
     if better.groupby("checkpoint")["n_tasks"].nunique().gt(1).any():
         lines.append("Each probability is over the tasks that both variants have runs on, which are not the same for all.")
     if (better["probability"].isin([0, 1]) & (better["low"] == better["high"])).any():
