@@ -266,6 +266,7 @@ AARL_SIMBA = BODIES["default_simba_64_entropy_bf16"]
 DENSE_MLP = {**BODIES["default_dense_mlp_bf16"], "ent_coef": "auto_0.1"}
 SIMBA: dict[str, dict[str, Any]] = {
     "aarl_simba": AARL_SIMBA,
+    "aarl_simba_repeat_4": AARL_SIMBA,
     "sac_simba": BODIES["default_simba_64_entropy_no_aux_bf16"],
     "aarl_dense_mlp": DENSE_MLP,
     "dense_mlp_alone": {**DENSE_MLP, "aux_loss": None},
@@ -311,7 +312,8 @@ def test_simba_differs_from_the_defaults_in_nothing_else() -> None:
     for name, changes in SIMBA.items():
         path = ZOO / "simba" / f"{name}.yml"
         for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
-            repeat = 2 if env_id.startswith(("dm_control/walker", "dm_control/finger")) else 4
+            often = env_id.startswith(("dm_control/walker", "dm_control/finger")) and not name.endswith("repeat_4")
+            repeat = 2 if often else 4
             steps = {"n_timesteps": 100_000 // repeat, "env_kwargs": {"action_repeat": repeat}}
             assert load_hyperparameters(path, env_id) == {**defaults, **changes, **steps}
         assert load_hyperparameters(path, "MyEnv-v0") == {**defaults, **changes}
