@@ -151,23 +151,9 @@ SMALL: dict[str, Any] = {"batch_size": 256, "policy_kwargs": {"net_arch": [256, 
 # What each file of choices/ changes, and of which variant.
 CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "aarl_state_bf16": ("aarl_state", {"precision": "bf16"}),
-    "aarl_state_bf16_joint": ("aarl_state", {"precision": "bf16", "joint_optimizer": True}),
-    "aarl_state_bf16_predictor": (
-        "aarl_state",
-        {"precision": "bf16", "predictor_width": None, "predictor_batch_norm": True},
-    ),
-    "aarl_state_bf16_separate": (
-        "aarl_state",
-        {"precision": "bf16", "policy_kwargs": {"share_features_extractor": False}},
-    ),
     "curl_state_bf16": ("curl_state", {"precision": "bf16"}),
     "sac_dense_mlp_bf16": ("sac_dense_mlp", {"precision": "bf16"}),
     "sac_identity_bf16": ("sac_identity", {"precision": "bf16"}),
-    "sac_identity_bf16_orthogonal": ("sac_identity", {"precision": "bf16", "policy_kwargs": {"ortho_init": True}}),
-    "sac_identity_bf16_orthogonal_squashed": (
-        "sac_identity",
-        {"precision": "bf16", "policy_kwargs": {"ortho_init": True, "squash_log_std": (-10, 2)}},
-    ),
     "aarl_state_small": ("aarl_state", SMALL),
     "aarl_state_small_bf16": ("aarl_state", {**SMALL, "precision": "bf16"}),
     "aarl_state_small_joint": ("aarl_state", {**SMALL, "joint_optimizer": True}),
@@ -178,7 +164,6 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "sac_dense_mlp_small": ("sac_dense_mlp", SMALL),
     "sac_dense_mlp_small_orthogonal": ("sac_dense_mlp", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "sac_identity_small": ("sac_identity", SMALL),
-    "sac_identity_small_bf16": ("sac_identity", {**SMALL, "precision": "bf16"}),
     "sac_identity_small_orthogonal": ("sac_identity", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "sac_identity_small_orthogonal_squashed": (
         "sac_identity",
