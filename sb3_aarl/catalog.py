@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -88,17 +89,23 @@ def published() -> tuple[PublishedLoss, ...]:
     )
 
 
-def resolve(value: "AuxLoss | str | Mapping[str, Any]") -> AuxLoss:
+def resolve(value: "AuxLoss | str | Path | Mapping[str, Any]") -> AuxLoss:
     """
-    The loss that a user means: an AuxLoss, a notation, a name of the catalogue, or the mapping of ``AuxLoss.to_dict``.
+    The loss that a user means: an AuxLoss, a notation, a name of the catalogue, the mapping of ``AuxLoss.to_dict``, or a YAML
+    file (``.yml``, ``.yaml``) whose key ``aux_loss`` has one of these, such as a cross-validation's ``winner.yml``.
 
     :param value: A value from code, YAML or the command line
-    :raises ValueError: when it is none of these
+    :raises ValueError: when it is none of these, with the file's name where it is one
     """
     if isinstance(value, AuxLoss):
         return value
+    if isinstance(value, Path) or (isinstance(value, str) and value.endswith((".yml", ".yaml"))):
+        try:
+            return resolve(yaml.safe_load(Path(value).read_text(encoding="utf-8")))
+        except (OSError, ValueError, yaml.YAMLError) as error:
+            raise ValueError(f"{value}: {error}") from None
     if isinstance(value, Mapping):
-        return AuxLoss.from_dict(value)
+        return resolve(value["aux_loss"]) if value.keys() == {"aux_loss"} else AuxLoss.from_dict(value)
     if not isinstance(value, str):
         raise ValueError(f"an auxiliary loss is an AuxLoss, a notation, a name or a mapping, not {value!r}")
     return AuxLoss.parse(value) if "{" in value or ">" in value else load(value)

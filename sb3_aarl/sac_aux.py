@@ -8,6 +8,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -82,10 +83,10 @@ class SACAux(SAC):
     :param verbose: 0 no output, 1 info, 2 debug
     :param seed: Seed of the pseudo random generators
     :param device: Device of the networks
-    :param aux_loss: An AuxLoss, its notation, a name of the catalogue, or None for SAC with the same encoder (the
-        paper's baseline). ``"auto"`` is AARL-Pixel if any observation is an image and AARL-State otherwise, and None
-        where neither can be trained: the encoder has no parameters that learn, or the replay buffer has no windows
-        (HerReplayBuffer is refused unless it is None)
+    :param aux_loss: An AuxLoss, its notation, a name of the catalogue, a YAML file such as a search's ``winner.yml``, or
+        None for SAC with the same encoder (the paper's baseline). ``"auto"`` is AARL-Pixel if any observation is an image
+        and AARL-State otherwise, and None where neither can be trained: the encoder has no parameters that learn, or the
+        replay buffer has no windows (HerReplayBuffer is refused unless it is None)
     :param aux_coef: Weight lambda of the auxiliary loss (equation 1). It matters with ``joint_optimizer=True``; by
         default the auxiliary loss has an Adam of its own, which divides a constant factor out again
     :param aux_batch_size: Windows for each auxiliary update, None for ``batch_size``
@@ -154,7 +155,7 @@ class SACAux(SAC):
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
-        aux_loss: AuxLoss | str | Mapping[str, Any] | None = "auto",
+        aux_loss: AuxLoss | str | Path | Mapping[str, Any] | None = "auto",
         aux_coef: float = 1.0,
         aux_batch_size: int | None = None,
         encoder_tau: float = 0.05,

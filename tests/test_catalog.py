@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -90,6 +91,16 @@ def test_capitals_and_published_candidates() -> None:
     assert len({candidate.name for candidate in published}) == len(published) == 124
     assert all(catalog.resolve(candidate.name) == candidate.loss for candidate in published)
     assert catalog.load("cheetah-run-state-4-4") == catalog.load("aarl-state")
+
+
+def test_a_file_of_one_loss(tmp_path: Path) -> None:
+    path = tmp_path / "winner.yml"
+    for text, problem in (("a: 1", "'a'"), ("aux_loss: curll", "curl"), ("aux_loss: 3", "not 3"), ("{", "flow node")):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=rf"(?s)winner.yml: .*{problem}"):
+            catalog.resolve(path)
+    path.write_text("aux_loss: curl")
+    assert catalog.resolve(path) == catalog.resolve(str(path)) == catalog.load("curl")
 
 
 def test_resolve() -> None:

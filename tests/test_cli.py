@@ -253,7 +253,7 @@ def test_search_reports_progress_and_resumes(folder: Path, executor: Executor) -
     write_search(folder, SMALLER)
     output = run("search", "small.yml", "--generations", 1, "--threads", 2, "--workers", 3)
     assert executor.arguments == (3,) and {run.threads for run in executor.runs} == {2}
-    assert "generation 1: 2/2 done, 0 running, 0 failed; best 1.00, 0:00:00 to go" in output
+    assert "generation 1: 2/2 done, 0 running, 0 failed; best 1.00, finished" in output
     assert "aarl dashboard runs/small" in output and "score 1.00" in output
     output = run("search", "small.yml", "--threads", 2)
     assert "generation 1: 2/2 done" in output and "generation 2: 2/2 done" in output and len(executor.runs) == 4
@@ -379,7 +379,9 @@ def test_a_search_for_real(folder: Path) -> None:
         time.sleep(0.1)
     process.send_signal(signal.SIGTERM)
     output, _ = process.communicate(timeout=60)
-    assert process.returncode == 130 and output.endswith("Interrupted. The same command resumes it.\n"), output
+    assert process.returncode == 130 and output.endswith(
+        "Interrupted. The same command resumes it, each run from its last evaluation.\n"
+    ), output
     (trial,) = optuna.load_study(study_name="small", storage=open_storage(Path("runs/small"))).trials
     assert trial.state == TrialState.FAIL and trial.user_attrs["interrupted"]
     output = aarl("search", config, "--generations", 1, "--workers", 2, folder=folder)

@@ -125,10 +125,13 @@ def test_a_search_may_name_a_shipped_file_or_none(folder: Path) -> None:
 
 
 def test_configs_lists_all_files_with_their_first_line() -> None:
-    shown, data = run("configs"), json.loads(run("configs", "--json"))
+    shown, data = run("configs", "--all"), json.loads(run("configs", "--all", "--json"))
     assert set(data["searches"]) == set(shipped_files(True)) and set(data["hyper-parameters"]) == set(shipped_files(False))
     for name, line in {**data["searches"], **data["hyper-parameters"]}.items():
         assert re.search(rf"{re.escape(name)} +│ +{re.escape(line)}", shown) and line
+    assert {name for kind in json.loads(run("configs", "--json")).values() for name in kind} == {
+        name for kind in data.values() for name in kind if "/" not in name
+    }
 
 
 @pytest.mark.slow
@@ -140,7 +143,8 @@ def test_init_writes_a_search_that_runs_and_overwrites_nothing(folder: Path) -> 
     config = load_config("own.yml")
     assert config.cross_validation and len(config.baselines) == 2
     assert "own.yml" in run("init", "own.yml", code=2) and Path("own.yml").read_text() == text
-    assert "9 runs" in run("search", "own.yml", "--generations", 1, "--dry-run")
+    # Candidates, baselines, and what is cross-validated.
+    assert f"All: {9 + 2 + 2 * 3} runs" in run("search", "own.yml", "--generations", 1, "--dry-run")
 
 
 @pytest.mark.slow
@@ -175,7 +179,7 @@ def test_status_of_a_search_and_its_baselines(folder: Path) -> None:
     run("search", "small.yml", "--generations", 1, "--workers", 2)
     shown, data = run("status", "small.yml"), json.loads(run("status", "runs/small", "--json"))
     assert re.search(r"generation 1 +│ +3 │ +3 │ +0 │ +0 │", shown)
-    assert data["search"]["best_loss"] in shown and f"score {data['search']['best']:.2f}; 0:00:00 to go" in shown
+    assert data["search"]["best_loss"] in shown and f"score {data['search']['best']:.2f}; finished" in shown
     run("baselines", "small.yml")
     shown, data = run("status"), json.loads(run("status", "small", "--json"))
     assert {row["variant"] for row in json.loads(run("baselines", "small.yml", "--json", stdout=True))} == {"CURL", "SAC"}

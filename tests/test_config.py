@@ -16,7 +16,6 @@ from search.studies.config import Baseline, CrossValidation, SearchConfig, load_
 from search.training.config import (
     ConfigError,
     check_hyperparameters,
-    load_aux_loss,
     load_hyperparameters,
     merge,
     read_yaml,
@@ -301,16 +300,6 @@ def test_short_names_of_environments() -> None:
         resolve_env_id("chetah-run")
 
 
-def test_a_file_of_one_loss(tmp_path: Path) -> None:
-    path = tmp_path / "winner.yml"
-    for text, problem in (("a: 1", "aux_loss"), ("aux_loss: curll", "aux_loss.*curl"), ("aux_loss: 3", "aux_loss")):
-        path.write_text(text)
-        with pytest.raises(ConfigError, match=rf"winner.yml.*{problem}"):
-            load_aux_loss(path)
-    path.write_text("aux_loss: curl")
-    assert load_aux_loss(path) == catalog.load("curl")
-
-
 # What is refused.
 
 WRONG: list[tuple[dict[str, Any], str]] = [
@@ -323,7 +312,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"baselines": [{"name": "a"}, {"name": "a"}]}, "baselines: must be one or more different"),
     ({"initial": ["curll"]}, "initial: .*nearest: curl"),
     ({"initial": ["curl"]}, "mean squared error"),  # which is all that is searched without `operators`
-    ({"initial": "missing.yml"}, "initial: .*missing.yml: cannot be read"),
+    ({"initial": "missing.yml"}, "initial: .*missing.yml: .*No such file"),
     ({"imports": ["no_such_module"]}, "imports: no_such_module cannot be imported"),
     ({"environment": 3}, "environment: should be a valid string, not 3"),
     ({"environment": "dm_control/cheetah-rum-v0"}, "environment: unknown environment .*cheetah-run"),

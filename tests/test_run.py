@@ -393,6 +393,7 @@ def test_environments_in_processes_are_the_same(tmp_path: Path) -> None:
         ({"environment": "CartPole-v1"}, r"CartPole-v1 cannot be trained with these settings: .*Box"),
         ({"environment": "Walk-v7"}, "Walk-v7 cannot be trained with these settings: .*Walk"),
         ({"environment": "Wide-v0"}, r"Wide-v0 cannot be trained with these settings: .*shape \(2,\)"),
+        ({"aux_loss": "{s_t} -> {s_t+17}"}, "episodes have 16 environment steps, the horizon of .* 17"),
         ({"imports": ("no_such_module",)}, "no_such_module"),
         ({"hyperparameters": DENSE | {"batch_size": 0}}, "batch_size must be at least 1"),
         ({"hyperparameters": DENSE | {"batch_sise": 1}}, "batch_sise"),
@@ -403,7 +404,7 @@ def test_environments_in_processes_are_the_same(tmp_path: Path) -> None:
         ({"hyperparameters": DENSE | {"env_kwargs": {"action_repeat": 5}}}, "checkpoint 32 is no multiple of .* 5 env"),
         ({"hyperparameters": DENSE | {"train_freq": [2, "episode"]}}, "train_freq"),
     ],
-    ids=["discrete", "unknown", "shape", "import", "value", "key", "rollout", "repeat", "episodes"],
+    ids=["discrete", "unknown", "shape", "horizon", "import", "value", "key", "rollout", "repeat", "episodes"],
 )
 def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as error:

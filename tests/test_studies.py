@@ -14,15 +14,16 @@ from optuna.storages import InMemoryStorage
 from optuna.trial import create_trial
 from tiny import SEARCH, YAML, write_search
 
-from sb3_aarl import AuxLoss, SACAux
+from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
 from search.evolution.space import distributions, loss_to_params
 from search.execution.matrix import Cell
 from search.studies import cross_validation, operator_selection
 from search.studies.config import SearchConfig, load_config
 from search.studies.search import SETTINGS_KEY, baselines, make_pruner, open_search, runs_of, settings
-from search.studies.single import train_one
-from search.training.config import ConfigError, load_aux_loss
+from search.studies.single import prepare_one
+from search.training.config import ConfigError
+from search.training.run import train
 
 PARTS = """\
 cross_validation:
@@ -168,7 +169,7 @@ def test_a_ranking_deviates_over_seeds_not_over_environments(tmp_path: Path) -> 
     assert (row["x"], row["y"], row["mean"], row["runs"]) == (100.0, 902.0, 501.0, 4)
     assert row["std"] == pytest.approx(np.std([499.0, 503.0], ddof=1))
     assert cross_validation.write_winner(table, tmp_path / "winner.yml") == LOSSES[0]
-    assert load_aux_loss(tmp_path / "winner.yml") == LOSSES[0]
+    assert catalog.resolve(tmp_path / "winner.yml") == LOSSES[0]
 
 
 def test_ten_operators_on_forward_dynamics(config: SearchConfig, tmp_path: Path) -> None:
@@ -211,7 +212,8 @@ def test_one_run_keeps_its_model_and_is_not_repeated(tmp_path: Path, monkeypatch
     Path("own.yml").write_text(YAML + "  n_timesteps: 205\n")
     Path("winner.yml").write_text(yaml.safe_dump({"aux_loss": LOSSES[0]}))
     arguments: dict[str, Any] = {"environment": "Pendulum-v1", "config": "own.yml", "evaluation_episodes": 1, "seed": 3}
-    curve, folder = train_one(aux_loss="winner.yml", n_evaluations=2, **arguments)
+    folder = prepare_one(aux_loss="winner.yml", n_evaluations=2, **arguments)
+    curve = train(folder)
     assert folder.parent == Path("runs") and folder.name.startswith("pendulum-v1-winner-yml-")
     assert [point.environment_steps for point in curve] == [102, 204] and curve == read_curve(folder / "curve.csv")
     model = SACAux.load(folder / "model.zip")
@@ -219,9 +221,10 @@ def test_one_run_keeps_its_model_and_is_not_repeated(tmp_path: Path, monkeypatch
     about = json.loads((folder / "provenance.json").read_text())
     assert about["sessions"][0]["aux_loss"] == str(LOSSES[0]) and about["seconds"] > 0
     # The seconds of the curve too.
-    assert train_one(aux_loss=str(LOSSES[0]), n_evaluations=2, folder=folder, **arguments) == (curve, folder)
+    assert prepare_one(aux_loss=str(LOSSES[0]), n_evaluations=2, folder=folder, **arguments) == folder
+    assert train(folder) == curve
     with pytest.raises(ValueError, match=f"{folder} has another run: aux_loss is"):
-        train_one(aux_loss="none", n_evaluations=2, folder=folder, **arguments)
+        prepare_one(aux_loss="none", n_evaluations=2, folder=folder, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -240,5 +243,5 @@ def test_what_cannot_be_trained_leaves_no_folder(
     monkeypatch.chdir(tmp_path)
     Path("own.yml").write_text(YAML + text)
     with pytest.raises(ValueError, match=message):
-        train_one(**{"environment": "Pendulum-v1", "aux_loss": None, "config": "own.yml", **changed})
+        prepare_one(**{"environment": "Pendulum-v1", "aux_loss": None, "config": "own.yml", **changed})
     assert not Path("runs").exists()

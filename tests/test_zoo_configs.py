@@ -123,7 +123,7 @@ def tasks_of(variant: str) -> tuple[str, ...]:
 
 
 def test_the_variants_are_all_there() -> None:
-    assert {path.stem for path in ZOO.glob("*.yml")} == {*VARIANTS, "default", "demo", "sac"}
+    assert {path.stem for path in ZOO.glob("*.yml")} == {*VARIANTS, "aarl_simba", "default", "demo", "sac"}
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -293,9 +293,10 @@ def test_bodies_differ_in_nothing_else() -> None:
 
 def test_simba_differs_from_the_defaults_in_nothing_else() -> None:
     defaults = load_hyperparameters(ZOO / "default.yml", "MyEnv-v0")
-    assert {path.stem for path in (ZOO / "simba").glob("*.yml")} == SIMBA.keys()
-    for name, changes in SIMBA.items():
-        path = ZOO / "simba" / f"{name}.yml"
+    paths = [ZOO / "aarl_simba.yml", *(ZOO / "simba").glob("*.yml")]
+    assert {path.stem for path in paths} == SIMBA.keys()
+    for path in paths:
+        name, changes = path.stem, SIMBA[path.stem]
         for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
             often = env_id.startswith(("dm_control/walker", "dm_control/finger")) and not name.endswith("repeat_4")
             repeat = 2 if often else 4

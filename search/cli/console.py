@@ -64,6 +64,8 @@ def live() -> Iterator[Callable[[str, object], None]]:
 
 def time_to_go(seconds: float | None) -> str:
     """An estimate such as ``0:10:00 to go``."""
+    if seconds == 0:
+        return "finished"
     return f"{'?' if seconds is None else timedelta(seconds=round(seconds))} to go"
 
 

@@ -23,7 +23,7 @@ class Program(TyperGroup):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            errors.print("Interrupted. The same command resumes it.")
+            errors.print("Interrupted. The same command resumes it, each run from its last evaluation.")
             raise typer.Exit(130) from None
         except Exception as error:
             line = explain(error)
@@ -36,7 +36,8 @@ class Program(TyperGroup):
 def explain(error: Exception) -> str | None:
     """One line, without passwords, about an error that a user can fix; None for another one."""
     kinds: list[type[Exception]] = [ValueError, OSError, FloatingPointError]
-    line = " ".join(str(error).split())
+    problems = str(error).splitlines() if isinstance(error, ValueError) else [str(error)]
+    line = "\n".join(" ".join(problem.split()) for problem in problems)
     if isinstance(error, OSError) and error.filename is not None:
         line = f"{error.filename}: {error.strerror}"
     if isinstance(error, ModuleNotFoundError):

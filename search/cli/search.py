@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from search.execution.driver import SearchProgress
     from search.studies.config import SearchConfig
+    from search.training.run import Run
 
 app = typer.Typer()
 # Seconds between two drawings of the evolution, which holds every candidate.
@@ -60,14 +61,14 @@ def search(
     from search.execution.storage import open_storage
     from search.results.dashboard import update_plots
     from search.results.report import stored_baselines
-    from search.studies.search import all_runs, open_search, runs_of
+    from search.studies.search import open_search, runs_of
     from search.training.provenance import hide_password
 
     logging.set_verbosity(logging.WARNING)
     settings = read_config(config, threads=threads, generations=generations, pruner=pruner)
     at_once = workers or (settings.population_size * len(settings.seeds) if executor == "ray" else 1)
     if dry_run:
-        show_costs({settings.name: all_runs(settings)}, at_once)
+        show_costs(planned(settings), at_once)
         return
     path = run_folder(config, folder)
     opened = open_storage(path, storage)
@@ -93,6 +94,20 @@ def search(
         say(f"Best: {shown.best_loss}, score {shown.best:.2f}")
         if settings.cross_validation:
             say(f"Does it hold with other seeds? aarl cross-validate {config}")
+
+
+def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
+    """All runs of a search's file by kind: candidates, baselines, cross-validation."""
+    from search.execution.matrix import task_name
+    from search.studies import cross_validation
+    from search.studies.search import all_runs, baselines
+
+    kinds = {config.name: all_runs(config)}
+    for cell, run in baselines(config, Path()).runs.items():
+        kinds.setdefault(f"baselines: {cell.variant}", []).append(run)
+    for cell, run in cross_validation.all_runs(config).items() if config.cross_validation else ():
+        kinds.setdefault(f"cross-validate: {task_name(cell.environment)}", []).append(run)
+    return kinds
 
 
 def annotations(study: "Study", config: "SearchConfig", folder: Path) -> "Callable[[Trial], None]":

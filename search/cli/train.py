@@ -45,7 +45,9 @@ def train(
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.callbacks import aulc
-    from search.studies.single import train_one
+    from search.studies.single import prepare_one
+    from search.training.run import read_run
+    from search.training.run import train as train_run
 
     started = time.monotonic()
 
@@ -59,9 +61,10 @@ def train(
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
-    curve, path = train_one(
-        env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, bar, on_evaluation, modules(imports)
-    )
+    path = prepare_one(env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, modules(imports))
+    planned = ", ".join(f"{point:,}" for point in read_run(path).checkpoints)
+    errors.print(f"Into {path}; evaluations, from which it can be resumed, at {planned} environment steps")
+    curve = train_run(path, bar, on_evaluation)
     if json:
         say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})
         return
@@ -95,13 +98,15 @@ def losses(
 
 
 @app.command(rich_help_panel="One agent")
-def configs(json: Json = False) -> None:
+def configs(
+    every: Annotated[bool, typer.Option("--all", help="Those of the experiments in results/ too.")] = False, json: Json = False
+) -> None:
     """List the configurations that come with the package, for commands that take a file."""
     from search.training.shipped import shipped_files
 
     kinds = {"Hyper-parameters: aarl train --config NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
     found = {
-        title: {name: first_sentence(path) for name, path in files.items()}
+        title: {name: first_sentence(path) for name, path in files.items() if every or "/" not in name}
         for title, files in ((title, shipped_files(searches)) for title, searches in kinds.items())
     }
     if json:

@@ -153,7 +153,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
         if isinstance(value, list | tuple):
             return tuple(loss for item in value for loss in cls._losses(item, info))
         if isinstance(value, str) and value.endswith((".yml", ".yaml")):
-            return (training.load_aux_loss(info.data["path"].parent / value),)
+            return (catalog.resolve(info.data["path"].parent / value),)
         if value == "published":
             losses = [candidate.loss for candidate in catalog.published()]
         elif value == "handcrafted":

@@ -9,14 +9,16 @@ import optuna
 import pandas as pd
 import yaml
 
+from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
 from search.evolution.space import loss_of
 from search.execution.matrix import Cell, Matrix
 from search.results.trials import ranked
-from search.studies.config import Baseline, SearchConfig
+from search.studies.config import Baseline, CrossValidation, SearchConfig
 from search.studies.search import make_run
 from search.training.config import ConfigError
+from search.training.run import Run
 
 logger = logging.getLogger(__name__)
 
@@ -41,9 +43,7 @@ def make_matrix(
     The runs of a cross-validation: candidates and baselines x environments x seeds; ``top`` replaces the configuration's
     number of candidates.
     """
-    section = config.cross_validation
-    if section is None:
-        raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
+    section = _section(config)
     if config.environment in section.environments and (own := sorted({*config.seeds} & {*section.seeds})):
         logger.warning(
             "cross_validation.seeds has %s, as the search on %s: the scores that candidates were chosen for count again",
@@ -51,14 +51,31 @@ def make_matrix(
             config.environment,
         )
     losses = top_losses(study, section.top if top is None else top)
-    runs = {}
     candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
-    for seed, environment, variant in product(section.seeds, section.environments, [*candidates, *baselines]):
+    runs = _make_runs(config, [*candidates, *baselines])
+    return Matrix(f"{study.study_name}-cross-validation", folder / "cross-validation", runs)
+
+
+def all_runs(config: SearchConfig) -> dict[Cell, Run]:
+    """The runs of a cross-validation whose candidates are not known yet, each with AARL-State: what it would cost."""
+    loss = catalog.load("aarl-state")
+    return _make_runs(config, [Baseline(name=str(n), aux_loss=loss) for n in range(_section(config).top)])
+
+
+def _section(config: SearchConfig) -> CrossValidation:
+    if config.cross_validation is None:
+        raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
+    return config.cross_validation
+
+
+def _make_runs(config: SearchConfig, variants: Sequence[Baseline]) -> dict[Cell, Run]:
+    section, runs = _section(config), {}
+    for seed, environment, variant in product(section.seeds, section.environments, variants):
         run = make_run(config, environment, variant.aux_loss, seed, variant.overrides)
         # On the search's environment, runs may be longer than those of its candidates.
         checkpoints = section.checkpoints.get(environment, config.checkpoints)
         runs[Cell(variant.name, environment, seed)] = run.model_copy(update={"checkpoints": checkpoints})
-    return Matrix(f"{study.study_name}-cross-validation", folder / "cross-validation", runs)
+    return runs
 
 
 def ranking(runs: pd.DataFrame) -> pd.DataFrame:

@@ -2,20 +2,18 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_aarl import SACAux, catalog
-from sb3_aarl.callbacks import Evaluation
 from sb3_aarl.envs import PREFIX
 from search.training.config import (
     ConfigError,
     action_repeat,
     import_modules,
-    load_aux_loss,
     load_hyperparameters,
     resolve_env_id,
 )
@@ -30,14 +28,13 @@ from search.training.run import (
     prepare_run,
     read_run,
     spread_checkpoints,
-    train,
 )
 from search.training.shipped import find_file
 
 VIDEO_SIZE = 320  # pixels, height and width
 
 
-def train_one(
+def prepare_one(
     environment: str,
     aux_loss: str | None,
     config: str | Path | None,
@@ -47,19 +44,17 @@ def train_one(
     seed: int = 0,
     threads: int = 1,
     folder: str | Path | None = None,
-    progress_bar: bool = True,
-    on_evaluation: Callable[[list[Evaluation]], bool | None] | None = None,
     imports: Sequence[str] = (),
-) -> tuple[list[Evaluation], Path]:
+) -> Path:
     """
-    Train with one loss in this process, and keep model, learning curve and ``provenance.json``.
+    Prepare the folder of a run with one loss, which keeps its model, for :func:`search.training.run.train`.
 
-    :param aux_loss: Notation, name, or YAML file of ``load_aux_loss``; ``"none"`` for none; None for what the file of
-        hyper-parameters says, or ``"auto"``
+    :param aux_loss: Notation, name or YAML file; ``"none"`` for none; None for what the file of hyper-parameters says, or
+        ``"auto"``
     :param config: File of hyper-parameters, or name of a shipped one; None for ``aarl_state`` or ``default``
     :param environment_steps: Environment steps of the run, None for the file's ``n_timesteps``
     :param imports: Modules that are imported first
-    :return: The learning curve and the folder
+    :return: The folder
     :raises ValueError: when something is unknown or does not fit, or the folder has another run
     """
     import_modules(imports)
@@ -68,8 +63,6 @@ def train_one(
     hyperparameters = load_hyperparameters(file, environment)
     from_file = hyperparameters.pop("aux_loss", "auto")
     loss = from_file if aux_loss is None else aux_loss
-    if isinstance(loss, str) and Path(loss).suffix in (".yml", ".yaml"):
-        loss = load_aux_loss(loss)
     if loss in (None, "none"):
         loss = None
     elif loss != "auto":
@@ -96,7 +89,7 @@ def train_one(
     folder = Path(folder)
     check_run(run)
     prepare_run(folder, run)
-    return train(folder, progress_bar, on_evaluation), folder
+    return folder
 
 
 def load_trained(
@@ -115,7 +108,7 @@ def load_trained(
     run = read_run(folder) if (folder / RUN).exists() else None
     import_modules([*(run.imports if run else ()), *imports])
     if environment is None and run is None:
-        raise ValueError(f"which environment? {folder} has no {RUN} that names it")
+        raise ValueError(f"which environment? No {RUN} is beside {model}: name it as a second argument")
     env_id = resolve_env_id(environment) if environment is not None else run.environment  # type: ignore[union-attr]
     settings = run.hyperparameters if run else {}
     env_kwargs = settings.get("env_kwargs") or {}

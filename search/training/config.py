@@ -22,7 +22,6 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch.optim import Adam
 
 from sb3_aarl import SACAux, catalog
-from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import WindowReplayBuffer
 from sb3_aarl.encoders import ENCODERS, encoder_class
 from sb3_aarl.envs import NEEDS_DMC, PREFIX, env_ids, make_dmc_env, wrap_env
@@ -149,21 +148,6 @@ def env_wrappers(value: Any) -> list[tuple[str, str, dict[str, Any]]]:
     return found
 
 
-def load_aux_loss(path: str | Path) -> AuxLoss:
-    """
-    The loss that a cross-validation chose: the only key, ``aux_loss``, of a YAML file.
-
-    :raises ConfigError: naming the file and what is wrong with it
-    """
-    values = read_yaml(path)
-    if values.keys() != {"aux_loss"}:
-        raise ConfigError(f"{path}: must hold the key 'aux_loss' and no other, not {sorted(values)}")
-    try:
-        return catalog.resolve(values["aux_loss"])
-    except ValueError as error:
-        raise ConfigError(f"{path}: aux_loss: {error}") from None
-
-
 def action_repeat(hyperparameters: Mapping[str, Any]) -> int:
     """Environment steps of one agent step."""
     return (hyperparameters.get("env_kwargs") or {}).get("action_repeat", 1)
@@ -188,8 +172,8 @@ def resolve_env_id(name: str) -> str:
     nearest = difflib.get_close_matches(name, known, cutoff=0.4)
     hint = "" if env_ids() or "-v" in name else f" {NEEDS_DMC}"
     raise ConfigError(
-        f"unknown environment {name!r}, nearest: {', '.join(nearest) or 'none'}. "
-        f"A module of yours that registers it belongs to the imports (--imports, or imports: in the file).{hint}"
+        f"unknown environment {name!r}: a module of yours that registers it belongs to the imports (--imports, or imports: in "
+        f"the file).{hint} The nearest: {', '.join(nearest) or 'none'}"
     )
 
 

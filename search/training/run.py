@@ -23,7 +23,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from sb3_aarl import SACAux
+from sb3_aarl import AuxLoss, SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, read_curve, replace_text, write_curve
 from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
 from search.training import checkpoint
@@ -266,13 +266,18 @@ def check_run(run: Run) -> None:
     try:
         setup = Setup(run, run.environment)
         with closing_env(setup.training_env()) as env:
-            learning_starts = setup.model(env).learning_starts
+            model = setup.model(env)
+            learning_starts = model.learning_starts
             env.reset()
             env.step(np.stack([env.action_space.sample() for _ in range(env.num_envs)]))
     except ConfigError:
         raise
     except Exception as error:  # Gymnasium, SB3 and PyTorch have errors of all kinds
         raise ConfigError(f"{run.environment} cannot be trained with these settings: {_one_line(error)}") from error
+    horizon = model.aux_loss.horizon * setup.action_repeat if isinstance(model.aux_loss, AuxLoss) else 0
+    if setup.episode_steps is not None and setup.episode_steps < horizon:
+        problem = f"have {setup.episode_steps} environment steps, the horizon of {model.aux_loss} {horizon}"
+        raise ConfigError(f"{run.environment} cannot be trained with these settings: episodes {problem}")
     if setup.agent_steps <= learning_starts:
         logger.warning("%d agent steps are all random actions: learning_starts is %d", setup.agent_steps, learning_starts)
     apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
