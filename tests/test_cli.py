@@ -154,7 +154,7 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
         (["Pendulum-v1", "--aux-loss", "curll"], "nearest: curl"),
         (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "position 10"),
         (["Pendulum-v1", "--steps", "3", "--evaluations", "5"], "too few"),
-        (["Pendulum-v1", "--config", "body/simbaa"], "nearest: body/simba"),
+        (["Pendulum-v1", "--config", "simba/sac_simbaa"], "nearest: simba/sac_simba"),
         (["CartPole-v1", "--steps", "1000"], "CartPole-v1 cannot be trained"),
     ],
     ids=["environment", "module", "name", "notation", "steps", "file", "actions"],

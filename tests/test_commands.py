@@ -79,8 +79,8 @@ def run(*arguments: object, code: int = 0, stdout: bool = False) -> str:
         ("demo", True, "search/demo.yml"),
         ("demo", False, "demo.yml"),
         ("aarl_state.yml", False, "aarl_state.yml"),
-        ("body/simba", False, "body/simba.yml"),
-        ("simba", False, "body/simba.yml"),
+        ("simba/sac_simba", False, "simba/sac_simba.yml"),
+        ("sac_simba", False, "simba/sac_simba.yml"),
         ("zoo_configs/search/demo.yml", True, "search/demo.yml"),
     ],
 )
@@ -109,7 +109,7 @@ def test_a_file_that_is_there_wins(folder: Path) -> None:
         ("search dmo", "demo"),
         ("baselines cheetah_run_sate", "cheetah_run_state"),
         ("benchmark arl_state --envs cheetah-run", "aarl_state"),
-        ("train cheetah-run --config simbaa", "body/simba"),
+        ("train cheetah-run --config sac_simbaa", "simba/sac_simba"),
     ],
 )
 def test_an_unknown_name_has_the_nearest(arguments: str, nearest: str) -> None:

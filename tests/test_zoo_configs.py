@@ -180,123 +180,51 @@ def test_choices_differ_in_nothing_else() -> None:
             assert load_hyperparameters(path, env_id) == merge(load_hyperparameters(ZOO / f"{variant}.yml", env_id), changes)
 
 
-def policy(**kwargs: Any) -> dict[str, Any]:
-    return {"policy_kwargs": kwargs}
+def simba(width: int, **kwargs: Any) -> dict[str, Any]:
+    extractor = {"features_extractor_class": "simba", "features_extractor_kwargs": {"features_dim": width}}
+    return {"precision": "bf16", "policy_kwargs": extractor | kwargs}
 
 
-# How each differs from dense_mlp.yml; None: the key is not there. Those of `default_` differ from SACAux's defaults.
+def with_policy(values: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+    return merge(values, {"policy_kwargs": kwargs})
+
+
+ENTROPY = {"ent_coef": "auto_0.1"}
+DENSE_MLP = {"precision": "bf16", "policy_kwargs": {"features_extractor_class": "dense_mlp"}}
+PAPERS, FINALIST = DENSE_MLP | ENTROPY, simba(64) | ENTROPY
+BLOCKS: dict[str, Any] = {"net_arch": [128], "network": "simba"}
+# How files differ from SACAux's defaults: bodies that were compared, the finalist, its parts, and what it is compared with.
 BODIES: dict[str, dict[str, Any]] = {
-    "dense_mlp": {},
-    "dense_mlp_heads": policy(net_arch=[128], network="simba"),
-    "dense_mlp_normalized": {"normalize": {"norm_reward": False}},
-    "simba": {},
-    "simba_bf16": {"precision": "bf16"},
-    "simba_64_bf16": {"precision": "bf16", **policy(features_extractor_kwargs={"features_dim": 64})},
-    "simba_all": policy(net_arch=[128], network="simba"),
-    "simba_critic_norm": policy(network={"pi": "mlp", "qf": "layer_norm"}),
-    "simba_no_aux": {"aux_loss": None, "encoder_tau": None, "predictor_width": None},
-    "default_simba_bf16": {
-        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 128}),
-        "precision": "bf16",
-    },
-    "default_simba_entropy_bf16": {
-        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 128}),
-        "ent_coef": "auto_0.1",
-        "precision": "bf16",
-    },
-    "default_simba_64_entropy_bf16": {
-        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 64}),
-        "ent_coef": "auto_0.1",
-        "precision": "bf16",
-    },
-    "default_simba_64_bf16": {
-        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 64}),
-        "precision": "bf16",
-    },
-    "default_simba_32_entropy_bf16": {
-        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 32}),
-        "ent_coef": "auto_0.1",
-        "precision": "bf16",
-    },
-    "default_simba_64_entropy_no_aux_bf16": {
-        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 64}),
-        "ent_coef": "auto_0.1",
-        "aux_loss": None,
-        "precision": "bf16",
-    },
-    "default_simba_64_entropy_two_steps_bf16": {
-        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 64}),
-        "ent_coef": "auto_0.1",
-        "gradient_steps": 2,
-        "precision": "bf16",
-    },
-    "default_simba_64_entropy_weight_decay_bf16": {
-        **policy(
-            features_extractor_class="simba",
-            features_extractor_kwargs={"features_dim": 64},
-            optimizer_kwargs={"weight_decay": 0.01, "decoupled_weight_decay": True},
-        ),
-        "ent_coef": "auto_0.1",
-        "precision": "bf16",
-    },
-    "default_simba_64_entropy_unnormalized_bf16": {
-        **policy(features_extractor_class="simba", features_extractor_kwargs={"features_dim": 64, "normalize": False}),
-        "ent_coef": "auto_0.1",
-        "precision": "bf16",
-    },
-    "default_dense_mlp_bf16": {**policy(features_extractor_class="dense_mlp"), "precision": "bf16"},
-}
-# The finalist of body/, its parts, and what it is compared with; they differ from SACAux's defaults.
-AARL_SIMBA = BODIES["default_simba_64_entropy_bf16"]
-DENSE_MLP = {**BODIES["default_dense_mlp_bf16"], "ent_coef": "auto_0.1"}
-SIMBA: dict[str, dict[str, Any]] = {
-    "aarl_simba": AARL_SIMBA,
-    "aarl_simba_repeat_4": AARL_SIMBA,
-    "sac_simba": BODIES["default_simba_64_entropy_no_aux_bf16"],
-    "aarl_dense_mlp": DENSE_MLP,
-    "dense_mlp_alone": {**DENSE_MLP, "aux_loss": None},
-    "aarl_dense_mlp_heads": merge(DENSE_MLP, policy(net_arch=[128], network="simba")),
-    "aarl_dense_mlp_normalized": {**DENSE_MLP, "normalize": {"norm_reward": False}},
-    "aarl_simba_heads": merge(AARL_SIMBA, policy(net_arch=[128], network="simba")),
-    "aarl_simba_critic_norm": merge(AARL_SIMBA, policy(network={"pi": "mlp", "qf": "layer_norm"})),
-    "aarl_simba_unnormalized": BODIES["default_simba_64_entropy_unnormalized_bf16"],
-    "aarl_simba_two_steps": {**AARL_SIMBA, "gradient_steps": 2},
-    "aarl_simba_weight_decay": BODIES["default_simba_64_entropy_weight_decay_bf16"],
+    "body/default_dense_mlp_bf16": DENSE_MLP,
+    "body/default_simba_bf16": simba(128),
+    "body/default_simba_entropy_bf16": simba(128) | ENTROPY,
+    "body/default_simba_64_bf16": simba(64),
+    "body/default_simba_64_entropy_bf16": FINALIST,
+    "body/default_simba_64_entropy_no_aux_bf16": FINALIST | {"aux_loss": None},
+    "body/default_simba_32_entropy_bf16": simba(32) | ENTROPY,
+    "aarl_simba": FINALIST,
+    "simba/aarl_simba_repeat_4": FINALIST,
+    "simba/sac_simba": FINALIST | {"aux_loss": None},
+    "simba/aarl_dense_mlp": PAPERS,
+    "simba/dense_mlp_alone": PAPERS | {"aux_loss": None},
+    "simba/aarl_simba_heads": with_policy(FINALIST, **BLOCKS),
+    "simba/aarl_dense_mlp_heads": with_policy(PAPERS, **BLOCKS),
+    "simba/aarl_simba_critic_norm": with_policy(FINALIST, network={"pi": "mlp", "qf": "layer_norm"}),
+    "simba/aarl_simba_unnormalized": with_policy(FINALIST, features_extractor_kwargs={"normalize": False}),
+    "simba/aarl_dense_mlp_normalized": PAPERS | {"normalize": {"norm_reward": False}},
+    "simba/aarl_simba_two_steps": FINALIST | {"gradient_steps": 2},
+    "simba/aarl_simba_weight_decay": with_policy(
+        FINALIST, optimizer_kwargs={"weight_decay": 0.01, "decoupled_weight_decay": True}
+    ),
 }
 
 
-def test_bodies_differ_in_nothing_else() -> None:
-    def plain(values: Any) -> Any:
-        """Without keys that are None."""
-        return (
-            {key: plain(value) for key, value in values.items() if value is not None} if isinstance(values, dict) else values
-        )
-
-    assert {path.stem for path in (ZOO / "body").glob("*.yml")} == BODIES.keys()
-    for name, changes in BODIES.items():
-        path = ZOO / "body" / f"{name}.yml"
-        for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
-            wanted = merge(load_hyperparameters(ZOO / "aarl_state.yml", "dm_control/hopper-stand-v0"), SMALL)
-            if name.startswith("simba"):
-                wanted["policy_kwargs"] |= {
-                    "features_extractor_class": "simba",
-                    "features_extractor_kwargs": {"features_dim": 128},
-                }
-            wanted = merge(wanted, {"learning_rate": 3e-4, **changes})
-            if name.startswith("default_"):
-                wanted = {**load_hyperparameters(ZOO / "default.yml", env_id), **changes, "n_timesteps": 25_000}
-                wanted["env_kwargs"] = {"action_repeat": 4}
-            if env_id.startswith(("dm_control/walker", "dm_control/finger")):
-                wanted |= {"n_timesteps": 50_000, "env_kwargs": {"action_repeat": 2}}
-            assert plain(load_hyperparameters(path, env_id)) == plain(wanted)
-
-
-def test_simba_differs_from_the_defaults_in_nothing_else() -> None:
+def test_bodies_differ_from_the_defaults_in_nothing_else() -> None:
     defaults = load_hyperparameters(ZOO / "default.yml", "MyEnv-v0")
-    paths = [ZOO / "aarl_simba.yml", *(ZOO / "simba").glob("*.yml")]
-    assert {path.stem for path in paths} == SIMBA.keys()
-    for path in paths:
-        name, changes = path.stem, SIMBA[path.stem]
+    folders = [path.relative_to(ZOO).with_suffix("").as_posix() for path in ZOO.glob("*/*.yml")]
+    assert {name for name in folders if name.startswith(("body/", "simba/"))} | {"aarl_simba"} == BODIES.keys()
+    for name, changes in BODIES.items():
+        path = ZOO / f"{name}.yml"
         for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
             often = env_id.startswith(("dm_control/walker", "dm_control/finger")) and not name.endswith("repeat_4")
             repeat = 2 if often else 4

@@ -8,7 +8,7 @@ SEARCHES = ZOO / "search"
 
 
 def shipped_files(searches: bool) -> dict[str, Path]:
-    """The shipped files by name, such as ``aarl_state`` or ``body/simba``: configurations of searches, or hyper-parameters."""
+    """The shipped files by name, such as ``aarl_state`` or ``simba/sac_simba``: configurations of searches, or hyper-parameters."""
     folder = SEARCHES if searches else ZOO
     files = [path for path in sorted(folder.rglob("*.yml")) if searches or SEARCHES not in path.parents]
     return {path.relative_to(folder).with_suffix("").as_posix(): path for path in files}
@@ -16,8 +16,8 @@ def shipped_files(searches: bool) -> dict[str, Path]:
 
 def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path:
     """
-    A file that is there, or else the shipped one of that name: ``demo``, ``body/simba``, ``simba``,
-    ``zoo_configs/body/simba.yml``.
+    A file that is there, or else the shipped one of that name: ``demo``, ``simba/sac_simba``, ``simba``,
+    ``zoo_configs/simba/sac_simba.yml``.
 
     :raises ValueError: with the nearest name, when there is no such file
     """
