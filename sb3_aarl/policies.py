@@ -15,12 +15,17 @@ from stable_baselines3.sac.policies import Actor as SB3Actor
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
-from sb3_aarl.augmentation import center_crop, image_spaces, random_crop, random_shift
+from sb3_aarl.augmentation import (
+    CROP_SIZE,
+    center_crop,
+    cropped_space,
+    image_spaces,
+    random_crop,
+    random_shift,
+    resolve_augmentation,
+)
 from sb3_aarl.encoders import DenseMLP, Encoder, MultiInputEncoder, PixelEncoder, encoder_class
 from sb3_aarl.networks import hidden_layers, orthogonal_init
-
-AUGMENTATIONS = ("auto", "random_crop", "random_shift", "none")
-CROP_SIZE = 84  # paper, table 7
 
 
 class _CropsImages:
@@ -421,50 +426,3 @@ class MultiInputPolicy(SACAuxPolicy):
     """SACAuxPolicy for Dict observations of vectors and images. Parameters as there."""
 
     default_encoder = MultiInputEncoder
-
-
-def cropped_space(space: spaces.Space, size: int, normalized_image: bool) -> spaces.Space:
-    """
-    The observation space after images were cropped.
-
-    :param space: Observation space, images channel first
-    :param size: Height and width in pixels of cropped images
-    :param normalized_image: As in :func:`image_spaces`
-    """
-    images = image_spaces(space, normalized_image)
-    cropped = {
-        key: spaces.Box(box.low[:, :size, :size], box.high[:, :size, :size], dtype=box.dtype)  # type: ignore[arg-type]
-        for key, box in images.items()
-    }
-    if isinstance(space, spaces.Dict):
-        return spaces.Dict({**space.spaces, **cropped})
-    return cropped.get("", space)
-
-
-def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int | None, normalized_image: bool) -> str:
-    """
-    What ``augmentation`` means for these observations.
-
-    :param augmentation: One of ``AUGMENTATIONS``
-    :param space: Observation space, images channel first
-    :param crop_size: Height and width in pixels of cropped images, None for 84 if images are larger
-    :param normalized_image: As in :func:`image_spaces`
-    :return: ``random_crop``, ``random_shift`` or ``none``
-    :raises ValueError: for an unknown name, and for images that are smaller than the crop
-    """
-    if augmentation not in AUGMENTATIONS:
-        raise ValueError(f"unknown augmentation {augmentation!r}, expected one of {', '.join(AUGMENTATIONS)}")
-    sizes = {key: box.shape[1:] for key, box in image_spaces(space, normalized_image).items()}
-    if not sizes:
-        return "none"
-    needs_crop = augmentation == "random_crop" or (augmentation == "auto" and crop_size is not None)
-    crop_size = CROP_SIZE if crop_size is None else crop_size
-    for key, size in sizes.items():
-        if needs_crop and min(size) < crop_size:
-            raise ValueError(
-                f"images{f' under {key!r}' if key else ''} of {size[0]} x {size[1]} pixels are smaller than the crop of "
-                f"{crop_size} x {crop_size}: render them larger, or ask for augmentation='random_shift'"
-            )
-    if augmentation == "auto":
-        return "random_crop" if min(map(min, sizes.values())) > crop_size else "random_shift"
-    return augmentation

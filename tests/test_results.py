@@ -18,7 +18,8 @@ from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from search.cli.main import app
 from search.execution.matrix import cell_folder
-from search.results.table import paper_scores
+from search.results.statistics import interquartile_means
+from search.results.table import paper_scores, read_runs
 from search.studies import benchmark
 from search.studies.benchmark import load_benchmark, read_abouts
 from search.training.provenance import ABOUT
@@ -185,16 +186,26 @@ def test_defaults_are_what_was_decided() -> None:
 
 def test_figures_of_the_first_readme() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
-    variants = [f"{name}_small" for name in ("aarl_state", "sac_dense_mlp", "curl_state", "sac_identity")]
+    variants = [f"{name}_small" for name in ("sac_identity", "sac_dense_mlp", "aarl_state")]
+    simba = {
+        "cheetah-run": last_returns("aarl_simba", folder="simba_cheetah_run"),
+        "walker-walk": last_returns("aarl_simba_repeat_4", "walker-walk", "simba"),
+    }
     for row, task in (("Cheetah-Run", "cheetah-run"), ("Walker-Walk", "walker-walk")):
-        assert " | ".join([row, *(shown(last_returns(variant, task)) for variant in variants)]) in readme
-    n_runs = [len(last_returns(variant, task)) for variant in variants for task in TASKS]
-    assert n_runs == [3] * 6 + [n_runs[6]] * 2 and f"over 3 seeds, {n_runs[6]} of the last" in readme
-    ours, sacs = (
-        " and ".join(f"{value:,.0f}" for value in last_returns(variant, "HalfCheetah-v5", "defaults"))
-        for variant in ("entropy_sac", "sac")
-    )
-    assert f"SACAux {ours}, SAC {sacs}." in readme
+        runs = [*(last_returns(variant, task) for variant in variants), simba[task]]
+        assert " | ".join([row, *map(shown, runs)]) in readme
+        assert [len(some) for some in runs] == [5, 3, 3, 10 if task == "cheetah-run" else 3]
+    for row, names in (
+        ("the paper's encoder", ("dense_mlp_alone", "aarl_dense_mlp")),
+        ("`simba`", ("sac_simba", "aarl_simba")),
+    ):
+        means = [f"{statistics.mean(last_returns(name, folder='simba_cheetah_run')):.0f}" for name in names]
+        assert " | ".join([row, *means]) in readme
+    for text, task in (("Reacher-Hard ({})", "reacher-hard"), ("Finger-Spin ({})", "finger-spin")):
+        assert text.format(f"{statistics.mean(last_returns('aarl_simba', task, 'simba')):.0f}") in readme
+    iqm = interquartile_means(read_runs(RESULTS / "simba_cheetah_run")).set_index("variant").loc["aarl_simba"]
+    interval = f"interquartile mean of ten seeds not used for tuning, 95 % interval {iqm['low']:.0f} to {iqm['high']:.0f}"
+    assert f"{iqm['iqm']:.0f} ({interval})" in readme and iqm["runs"] == 10
     paper = paper_scores(4).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'").set_index("column")
     for text, variant, column in (
         ("AARL-State gets {} on Cheetah-Run, where the paper has {}", "aarl_state_bf16", "AARL-State"),
