@@ -70,7 +70,10 @@ def test_the_papers_budgets(path: Path) -> None:
     expected = ("cheetah-run", "reacher-easy", "walker-walk") if pixel else ("cheetah-run", "hopper-hop", "quadruped-run")
     assert environments == tuple(f"dm_control/{task}-v0" for task in expected)
     for env_id in environments:
-        assert config.checkpoints_for(env_id) == (short if pixel or "cheetah" in env_id else long)
+        steps = config.checkpoints
+        if env_id != config.environment:
+            steps = config.cross_validation.checkpoints.get(env_id, steps)
+        assert steps == (short if pixel or "cheetah" in env_id else long)
         assert config.hyperparameters_for(env_id).get("env_kwargs", {}).get("pixels", False) is pixel
     assert len(config.baselines) == 3
     assert (config.operator_selection is not None) is pixel
@@ -151,7 +154,6 @@ def test_every_part_of_a_search_is_read(tmp_path: Path) -> None:
         environments=(walker, "Pendulum-v1"), seeds=(3,), top=2, checkpoints={"Pendulum-v1": (200,)}
     )
     assert config.operator_selection is not None and config.operator_selection.seeds == (1, 2)
-    assert config.checkpoints_for("Pendulum-v1") == (200,) and config.checkpoints_for(walker) == (400, 800)
     assert config.baselines[0] == Baseline(name="a", aux_loss=REWARD)
     assert [baseline.aux_loss for baseline in config.baselines[1:]] == [None, None]
     assert config.operators == ("mse", "inner")
@@ -309,6 +311,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"cross_validation": {}}, "cross_validation.environments: is missing"),
     ({"baselines": [{"name": "a", "aux_los": None}]}, r"baselines\[0\].aux_los: .*'aux_loss'"),
     ({"baselines": [{"name": "a", "aux_loss": "curll"}]}, r"baselines\[0\].aux_loss: .*nearest: curl"),
+    ({"baselines": [{"name": "a", "overrides": {"aux_loss": "curl"}}]}, r"baselines\[0\].overrides: aux_loss stands beside"),
     ({"baselines": [{"name": "a"}, {"name": "a"}]}, "baselines: must be one or more different"),
     ({"initial": ["curll"]}, "initial: .*nearest: curl"),
     ({"initial": ["curl"]}, "mean squared error"),  # which is all that is searched without `operators`

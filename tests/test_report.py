@@ -1,7 +1,6 @@
-"""The report of a study, and the notation typeset: parsed, and opened in a real browser."""
+"""The report of a study: parsed, and opened in a real browser."""
 
 import re
-import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from datetime import datetime, timedelta
 
@@ -11,45 +10,21 @@ import optuna
 import pytest
 import scipy.stats
 from browser import open_browser, requested
-from hypothesis import given
-from hypothesis import strategies as st
 from optuna.distributions import FloatDistribution
 from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, TrialState
 from selenium.webdriver.common.by import By
-from selenium.webdriver.support.ui import WebDriverWait
 
-from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from sb3_aarl.callbacks import Evaluation, write_curve
 from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
 from search.execution.matrix import Cell, cell_folder, stored_scores
 from search.results import analysis
-from search.results.report import generation_table, mathml, stored_baselines, write_report
+from search.results.report import generation_table, stored_baselines, write_report
 from search.training.provenance import write_about
 from search.training.run import Run, prepare_run
 
 START = datetime(2026, 1, 1)
 EVIL = "<script>document.title='owned'</script><img src=https://example.org/x.png>"
-
-
-@st.composite
-def losses(draw):
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    return random_loss(rng, operators=OPERATORS)
-
-
-@given(losses())
-def test_mathml_reads_as_the_notation(loss):
-    """Read back with an XML parser: every token a base with a subscript, in the order of the notation."""
-
-    def read(element):
-        if element.tag == "msub":
-            base, subscript = element
-            return f"{base.text}_{''.join(subscript.itertext())}"
-        return (element.text or "") + "".join(read(child) + (child.tail or "") for child in element)
-
-    text = read(ElementTree.fromstring(f"<p>{mathml(loss)}</p>"))
-    assert AuxLoss.parse(text) == loss
 
 
 def make_trial(number, state, value, duration, loss=None, **attrs):
@@ -97,8 +72,7 @@ def completed(study):
 
 def read_page(path):
     page = lxml.html.parse(str(path)).getroot()
-    for script in page.xpath("//script"):
-        script.drop_tree()
+    assert not page.xpath("//script")
     return page
 
 
@@ -172,7 +146,7 @@ def test_what_the_report_says(study, page):
     assert dict(table_after(page, "Versions of packages, by trials")) == {name: str(n) for name, n in versions.items()}
     assert not page.xpath("//link | //iframe")
     addresses = page.xpath("//@src | //@href")
-    assert len(addresses) == 2 and all(address.startswith("data:image/svg+xml;base64,") for address in addresses)
+    assert len(addresses) == 3 and all(address.startswith("data:image/svg+xml;base64,") for address in addresses)
 
 
 # Section 3.3, typed in again.
@@ -311,32 +285,15 @@ def test_in_a_real_browser(study, tmp_path):
     write_report(study, path, [("SAC", 150.0), ("CURL", 180.0)])
     with open_browser(tmp_path / "profile") as browser:
         browser.get(path.as_uri())
-        wait = WebDriverWait(browser, 30)
-        (evolution,) = wait.until(lambda _: browser.find_elements(By.CLASS_NAME, "js-plotly-plot"))
-
-        def points(plot):
-            """Points of the first trace."""
-            return len(plot.find_elements(By.CSS_SELECTOR, ".scatterlayer .trace:first-child .points path"))
-
-        wait.until(lambda _: points(evolution) == len(best))
-        assert all(name in evolution.text for name in ("Generation", "Score", "SAC", "CURL"))
-        buttons = [button.get_attribute("data-title") for button in browser.find_elements(By.CLASS_NAME, "modebar-btn")]
-        assert "Zoom in" in buttons and not any("share" in title.lower() for title in buttons if title)
-        # Typeset: a subscript is set lower and smaller than what it belongs to.
-        base, subscript = browser.find_element(By.CSS_SELECTOR, ".winner msub").find_elements(By.XPATH, "./*")
-        bottom = {part: part.rect["y"] + part.rect["height"] for part in (base, subscript)}
-        assert bottom[subscript] > bottom[base]
-        size = [float(part.value_of_css_property("font-size")[:-2]) for part in (base, subscript)]
-        assert size[1] < size[0]
         assert browser.title.startswith("study <script>")
-        # Table 5 is shown as it is, and the pictures are drawn, each as wide as the text.
+        # Table 5 is shown as it is, and the pictures are drawn, none wider than the text.
         patterns = browser.find_element(By.XPATH, "//h2[.='Patterns']/following-sibling::div[1]")
         assert "Action, n_target > n_source" in patterns.text and patterns.is_displayed()
         pictures = browser.find_elements(By.CSS_SELECTOR, "figure img")
-        assert len(pictures) == 2 and all(picture.get_attribute("alt") for picture in pictures)
+        assert len(pictures) == 3 and all(picture.get_attribute("alt") for picture in pictures)
         for picture in pictures:
             assert int(picture.get_attribute("naturalWidth")) > 300
-            assert picture.rect["width"] == pytest.approx(patterns.rect["width"], abs=1) and picture.rect["height"] > 200
+            assert 500 < picture.rect["width"] <= patterns.rect["width"] + 1 and picture.rect["height"] > 200
         assert [trial.number for trial in best[:10]] == [
             int(row.find_elements(By.TAG_NAME, "td")[1].text)
             for row in browser.find_elements(By.XPATH, "//h2[.='Best losses']/following::table[1]/tbody/tr")

@@ -165,12 +165,10 @@ def test_the_model_is_kept_and_evaluated_as_documented(tmp_path: Path) -> None:
     assert not is_finished(tmp_path) and read_outcome(tmp_path) is None
 
 
-@pytest.mark.parametrize("by_file", [True, False], ids=["file", "callback"])
-def test_a_run_that_is_stopped_ends_at_its_next_evaluation(by_file: bool, tmp_path: Path) -> None:
+def test_a_run_that_is_stopped_ends_at_its_next_evaluation(tmp_path: Path) -> None:
     prepare_run(tmp_path, make_run())
-    if by_file:
-        (tmp_path / "stop").touch()
-    curve = train(tmp_path, on_evaluation=None if by_file else lambda curve: False)
+    (tmp_path / "stop").touch()
+    curve = train(tmp_path)
     assert [point.environment_steps for point in curve] == [32]
     assert read_outcome(tmp_path) is None and not (tmp_path / "checkpoint.pt").exists()
     prepare_run(tmp_path, make_run())

@@ -198,7 +198,7 @@ def dashboard(
     for name in (found.study_name for found in opened.get_all_studies()):
         study = load_study(opened, name)
         if SETTINGS_KEY in study.user_attrs:  # a search; baselines may have been trained since its last plot
-            update_plots(study, stored_baselines(path or Path("runs") / name))
+            update_plots(study, stored_baselines(Path("runs") / name if path is None or name != path.name else path))
     say(f"http://{host}:{port}/  (Ctrl-C to stop)")
     with suppress(KeyboardInterrupt):
         run_server(opened, host=host, port=port)

@@ -68,9 +68,6 @@ class Candidates:
         if attempt == 0:
             while (generation, slot) not in self.plan:
                 self._plan_next()
-            # And two of what comes next, so that the end of a generation need not plan the whole rest of its round.
-            for _ in range(min(2, len(self.to_plan))):
-                self._plan_next()
             return self.plan[generation, slot]
         number = self._round_of(generation, slot)
         while number == self.generation and self.to_plan:

@@ -244,8 +244,6 @@ def search_progress(study: optuna.Study, sampler: AuxLossSampler) -> SearchProgr
 def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:
     """A candidate's folder, named after generation, slot and attempt, so that the next trial of a slot finds its runs."""
     at = trial.user_attrs
-    if "slot" not in at:  # of a study.optimize of the user's own with more processes than slots
-        return folder / "candidates" / f"trial-{trial.number}"
     return folder / "candidates" / f"generation-{at['generation']}" / f"slot-{at['slot']:03}" / f"attempt-{at['attempt']}"
 
 

@@ -1,28 +1,23 @@
-"""One HTML file on what a search found: self-contained, and readable without JavaScript but for its plots to click."""
+"""One HTML file on what a search found: self-contained, without JavaScript."""
 
 import io
-import re
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import pandas as pd
-import plotly.graph_objects as go
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from optuna import Study
 from optuna.trial import FrozenTrial
-from plotly.io import to_html
 
-from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
 from search.execution.matrix import comparable, stored_scores, task_name
 from search.results import analysis
-from search.results.plots import evolution_figure, patterns_plot, rankings_plot
+from search.results.plots import evolution_plot, patterns_plot, rankings_plot
 from search.results.trials import lineage, ranked
 from search.studies import cross_validation
 from search.studies.search import SETTINGS_KEY
@@ -60,7 +55,7 @@ def write_report(
     trials = study.get_trials(deepcopy=False)
     table = analysis.trial_table(trials)
     best = ranked(trials, study.direction)
-    baselines = list(baselines)
+    title, baselines = study.study_name, list(baselines)
     machines = analysis.machines(trials)
     started = [f"{trial.datetime_start:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_start]
     ended = [f"{trial.datetime_complete:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_complete]
@@ -74,7 +69,7 @@ def write_report(
         hours=machines["hours"].sum(),
         generations=analysis.readable("generations", generation_table(table)),
         baselines=baselines,
-        evolution=_plot(evolution_figure(table, baselines, study.direction)) if best else None,
+        evolution=_picture(evolution_plot({title: table}, {title: baselines}, study.direction)) if best else None,
         best=_candidates(best[:N_BEST]),
         winner=_candidates(best[:1]).to_dict("records"),
         lineage=_candidates(sorted(lineage(best[0], trials), key=lambda trial: -trial.number)) if best else None,
@@ -90,32 +85,11 @@ def write_report(
 
 
 def _candidates(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
-    """Trials with their losses typeset, and their plain notation to copy."""
+    """Trials with their losses."""
     table = analysis.trial_table(trials)
     text = analysis.readable("candidates", table.set_index("number")[["score", "generation", "operation", "parents"]])
-    text.insert(0, "Loss", [_typeset(loss) for loss in table["loss"]])
+    text.insert(0, "Loss", [Markup("<code>{}</code>").format(loss or "no loss") for loss in table["loss"]])
     return text
-
-
-def mathml(loss: AuxLoss) -> str:
-    """The loss as the paper prints it, for HTML: one ``math`` element a token, as browsers break no line inside of one."""
-
-    def token(match: re.Match[str]) -> str:
-        offset = f"<mo>+</mo><mn>{match[2]}</mn>" if match[2] else ""
-        return f"<math><msub><mi>{match[1]}</mi><mrow><mi>t</mi>{offset}</mrow></msub></math>"
-
-    return re.sub(r"\b([sar])_t(?:\+(\d+))?", token, escape(str(loss).replace("->", "→")))
-
-
-def _typeset(loss: AuxLoss | None) -> Markup:
-    if loss is None:
-        return Markup("no loss")
-    return Markup('<div class="loss">{}</div><code>{}</code>').format(Markup(mathml(loss)), str(loss))
-
-
-def _variant(name: str) -> Markup:
-    """A candidate or a baseline."""
-    return _typeset(AuxLoss.parse(name)) if "->" in name else Markup.escape(name)
 
 
 def _validation(runs: pd.DataFrame | None) -> dict[str, Any] | None:
@@ -124,7 +98,7 @@ def _validation(runs: pd.DataFrame | None) -> dict[str, Any] | None:
         return None
     ranking = cross_validation.ranking(comparable(runs))
     text = ranking.map("{:.1f}".format).assign(runs=ranking["runs"].map("{:.0f}".format)).rename(columns=task_name)
-    text.insert(0, "Loss", [_variant(str(name)) for name in ranking.index])
+    text.insert(0, "Loss", [Markup("<code>{}</code>").format(name) for name in ranking.index])
     return {"ranking": text, "left_out": runs["variant"].nunique() - len(ranking)}
 
 
@@ -151,10 +125,3 @@ def _picture(figure: Figure) -> str:
     file = io.BytesIO()
     figure.savefig(file, format="svg", metadata={"Date": None})
     return f"data:image/svg+xml;base64,{b64encode(file.getvalue()).decode()}"
-
-
-def _plot(figure: go.Figure) -> Markup:
-    """A plot as HTML that contains plotly.js."""
-    # Without the button that would send the data to plotly's cloud.
-    config = {"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["sendChartToCloud"]}
-    return Markup(to_html(figure, config=config, full_html=False, default_height="520px"))

@@ -85,6 +85,13 @@ class Baseline(BaseModel, frozen=True, extra="forbid"):
     aux_loss: Annotated[AuxLoss | None, PlainValidator(_loss_or_none)] = None
     overrides: dict[str, Any] = {}
 
+    @field_validator("overrides")
+    @classmethod
+    def _without_loss(cls, overrides: dict[str, Any]) -> dict[str, Any]:
+        if "aux_loss" in overrides:
+            raise ValueError("aux_loss stands beside them")
+        return overrides
+
 
 class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     """
@@ -180,11 +187,6 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
         merged = training.merge(settings, self.overrides)
         return training.check_hyperparameters(training.merge(merged, overrides or {}), environment, f"{self.path}: overrides")
 
-    def checkpoints_for(self, environment: str) -> tuple[int, ...]:
-        """The environment steps of the evaluations on an environment."""
-        others = self.cross_validation.checkpoints if self.cross_validation else {}
-        return self.checkpoints if environment == self.environment else others.get(environment, self.checkpoints)
-
     def sampler_settings(self) -> dict[str, Any]:
         """The arguments of ``AuxLossSampler``, the number of generations included."""
         names = [name for name in inspect.signature(AuxLossSampler).parameters if name in type(self).model_fields]
@@ -206,13 +208,15 @@ def load_config(path: str | Path) -> SearchConfig:
         AuxLossSampler(**config.sampler_settings())
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
-    parts = [part for part in (config.cross_validation, config.operator_selection) if part]
-    for env_id in dict.fromkeys([config.environment, *(name for part in parts for name in part.environments)]):
+    others = config.cross_validation.checkpoints if config.cross_validation else {}
+    validated = config.cross_validation.environments if config.cross_validation else ()
+    own = [config.environment, *(config.operator_selection.environments if config.operator_selection else ())]
+    for env_id in dict.fromkeys([*own, *validated]):
         baselines = config.baselines if env_id == config.environment else ()
         for overrides in ({}, *(baseline.overrides for baseline in baselines)):
             interval = checkpoint_interval(config.hyperparameters_for(env_id, overrides))
-            longer = config.cross_validation.checkpoints.get(env_id, ()) if config.cross_validation else ()
-            between = [step for step in sorted({*config.checkpoints_for(env_id), *longer}) if step % interval]
+            steps = {*others.get(env_id, config.checkpoints), *(config.checkpoints if env_id in own else ())}
+            between = [step for step in sorted(steps) if step % interval]
             if between:
                 of_what = f"{interval} (train_freq x n_envs x action repeat of {env_id})"
                 raise ConfigError(f"{path}: checkpoints: must be multiples of {of_what}, {between} are not")

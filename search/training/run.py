@@ -304,15 +304,14 @@ def _one_line(error: BaseException) -> str:
 def train(
     folder: Path,
     progress_bar: bool = False,
-    on_evaluation: Callable[[list[Evaluation]], bool | None] | None = None,
+    on_evaluation: Callable[[list[Evaluation]], object] | None = None,
 ) -> list[Evaluation]:
     """
     Train the run of a folder in this process, from its last checkpoint on. On a CPU, a run that was killed and resumed ends
     bit for bit like an undisturbed one if ``reset(seed)`` determines all that its environment does.
 
     :param folder: Folder that :func:`prepare_run` has prepared
-    :param on_evaluation: Called with the curve so far after each evaluation; the run ends early if it returns False, as it
-        does if there is a file ``stop`` in the folder
+    :param on_evaluation: Called with the curve so far after each evaluation; a file ``stop`` in the folder ends the run there
     :return: The learning curve; that of a finished run is read, not trained again
     :raises filelock.Timeout: when another process trains it for longer than a minute
     """
@@ -329,9 +328,7 @@ def train(
         return read_curve(folder / CURVE)
 
 
-def _train(
-    folder: Path, run: Run, progress_bar: bool, on_evaluation: Callable[[list[Evaluation]], bool | None] | None
-) -> None:
+def _train(folder: Path, run: Run, progress_bar: bool, on_evaluation: Callable[[list[Evaluation]], object] | None) -> None:
     th.set_num_threads(run.threads)
     setup = Setup(run, str(folder / RUN))
     state = checkpoint.read(folder)
@@ -353,8 +350,9 @@ def _train(
         def report() -> bool:
             model.dump_logs()  # as SB3 does every fourth episode: TensorBoard has a point for each evaluation, the last too
             write_curve(folder / CURVE, evaluations.curve)
-            goes_on = on_evaluation is None or on_evaluation(evaluations.curve) is not False
-            return goes_on and not (folder / STOP).exists()
+            if on_evaluation is not None:
+                on_evaluation(evaluations.curve)
+            return not (folder / STOP).exists()
 
         add_session(folder, aux_loss=str(model.aux_loss), device=str(model.device), threads=run.threads)
         checkpoints = checkpoint.CheckpointCallback(folder, run.seed, evaluations.curve, report, state)
