@@ -13,9 +13,9 @@ KINDS = "sar"  # state, action, reward: the token of kind KINDS[j] at offset i h
 # Guards against a mistyped number that would ask for a mask of millions of bits.
 LONGEST_HORIZON = 1000
 
-_TOKEN = re.compile(r"([sar])_(?:\{\s*t\s*(?:\+\s*([0-9]+)\s*)?\}|t\s*(?:\+\s*([0-9]+))?)")
-_ARROW = re.compile(r"->|→|\\rightarrow|\\to(?![a-zA-Z])")
-_OPTIONS = re.compile(r"\[([^\[\]]*)\]")
+# Of a notation without spaces, ``$``, backslashes, and braces around indices.
+_TOKEN = re.compile(r"([sar])_t(?:\+([0-9]+))?")
+_NOTATION = re.compile(r"\{([^{}]*)\}->\{([^{}]*)\}(?:\[([^\[\]]*)\])?")
 
 
 class Token(NamedTuple):
@@ -28,11 +28,6 @@ class Token(NamedTuple):
     def of(cls, index: int) -> "Token":
         """The token at ``index`` of a mask."""
         return cls(KINDS[index % 3], index // 3)
-
-    @property
-    def index(self) -> int:  # type: ignore[override]
-        """The token's index in a mask."""
-        return 3 * self.offset + KINDS.index(self.kind)
 
     @property
     def horizon(self) -> int:
@@ -125,23 +120,18 @@ class AuxLoss:
         ``{s_t} -> {s_t} [bilinear, negatives, horizon=2]``.
 
         :param text: The notation
-        :param operator: As in the class; brackets in the text win over the default
-        :param negatives: As in the class; brackets in the text win over the default
-        :param horizon: None for the smallest that holds all tokens
-        :raises ValueError: with the position of what cannot be read, or the rule that the loss breaks
+        :param operator: As in the class, unless brackets in the text have another
+        :param negatives: As in the class, unless brackets in the text have it
+        :param horizon: None for the smallest that holds all tokens, unless brackets in the text have it
+        :raises ValueError: naming what cannot be read, or the rule that the loss breaks
         """
-        parser = _Parser(text)
-        source = parser.tokens()
-        parser.expect(_ARROW, "'->'")
-        target = parser.tokens()
-        options = parser.options()
-        parser.end()
-        given = {"operator": operator, "negatives": negatives, "horizon": horizon}
-        unset = {"operator": "mse", "negatives": False, "horizon": None}
-        for key, value in options.items():
-            if given[key] not in (unset[key], value):
-                raise ValueError(f"{key} is {given[key]!r}, but the notation says {value!r}: {text!r}")
-        return cls.from_tokens(source, target, **{**given, **options})
+        plain = re.sub(r"[\s$\\]", "", re.sub(r"\\(rightarrow|to)(?![a-zA-Z])|→", "->", str(text)))
+        match = _NOTATION.fullmatch(re.sub(r"_\{(t(?:\+[0-9]+)?)\}", r"_\1", plain))
+        if match is None:
+            raise ValueError(f"a notation is a text such as '{{s_t, a_t}} -> {{s_t+1}}', not {text!r}")
+        options = {"operator": operator, "negatives": negatives, "horizon": horizon}
+        options |= {} if match[3] is None else _options(match[3], text)
+        return cls.from_tokens(_tokens(match[1], text), _tokens(match[2], text), **options)  # type: ignore[arg-type]
 
     @property
     def source_tokens(self) -> tuple[Token, ...]:
@@ -212,79 +202,27 @@ def _checked_horizon(horizon: Any) -> int:
     return int(horizon)
 
 
-class _Parser:
-    """Reads a notation from left to right; every error says where it stands."""
-
-    def __init__(self, text: str):
-        if not isinstance(text, str):
-            raise ValueError(f"a notation is a string such as '{{s_t, a_t}} -> {{s_t+1}}', not {text!r}")
-        self.text = text
-        self.position = 0
-
-    def skip_space(self) -> None:
-        """White space and ``$`` mean nothing, wherever they stand."""
-        while self.position < len(self.text) and (self.text[self.position].isspace() or self.text[self.position] == "$"):
-            self.position += 1
-
-    def fail(self, expected: str) -> ValueError:
-        found = repr(self.text[self.position : self.position + 10]) if self.position < len(self.text) else "the end"
-        return ValueError(f"expected {expected} at position {self.position}, found {found}: {self.text!r}")
-
-    def accept(self, pattern: re.Pattern[str]) -> re.Match[str] | None:
-        self.skip_space()
-        match = pattern.match(self.text, self.position)
-        if match:
-            self.position = match.end()
-        return match
-
-    def expect(self, pattern: re.Pattern[str], expected: str) -> re.Match[str]:
-        match = self.accept(pattern)
+def _tokens(words: str, text: str) -> list[Token]:
+    """The tokens between two braces."""
+    tokens = []
+    for word in words.split(",") if words else []:
+        match = _TOKEN.fullmatch(word)
         if match is None:
-            raise self.fail(expected)
-        return match
+            raise ValueError(f"{word!r} is no token such as s_t, a_t+1 or r_t+2: {text!r}")
+        tokens.append(Token(match[1], int(match[2] or 0)))
+    return tokens
 
-    def tokens(self) -> list[Token]:
-        """One set: ``{token, token, ...}``, perhaps empty."""
-        self.expect(re.compile(r"\\?\{"), "'{'")
-        tokens: dict[Token, None] = {}
-        closing = re.compile(r"\\?\}")
-        while not self.accept(closing):
-            if tokens:
-                self.expect(re.compile(","), "',' or '}'")
-                self.skip_space()
-            start = self.position
-            match = self.expect(_TOKEN, "a token such as s_t, a_t+1 or r_t+2")
-            token = Token(match[1], int(match[2] or match[3] or 0))
-            if token in tokens:
-                self.position = start
-                raise self.fail(f"{token} once only")
-            tokens[token] = None
-        return list(tokens)
 
-    def options(self) -> dict[str, Any]:
-        """What stands in brackets behind the sets."""
-        match = self.accept(_OPTIONS)
-        options: dict[str, Any] = {}
-        for word in match[1].split(",") if match else []:
-            word = word.strip()
-            option: dict[str, Any] = {}
-            if word in OPERATORS:
-                option = {"operator": word}
-            elif word == "negatives":
-                option = {"negatives": True}
-            elif re.fullmatch(r"horizon\s*=\s*[0-9]{1,4}", word):
-                option = {"horizon": int(word.partition("=")[2])}
-            if not option or option.keys() & options.keys():
-                assert match is not None
-                self.position = match.start()
-                raise self.fail(f"an operator, 'negatives' or 'horizon=k', each once only, instead of {word!r}")
-            options |= option
-        return options
-
-    def end(self) -> None:
-        self.skip_space()
-        if self.position < len(self.text):
-            raise self.fail("nothing more")
+def _options(words: str, text: str) -> dict[str, Any]:
+    """What stands between brackets."""
+    options: dict[str, Any] = {}
+    for word in words.split(","):
+        horizon = re.fullmatch(r"horizon=([0-9]{1,4})", word)
+        key = "operator" if word in OPERATORS else "horizon" if horizon else word
+        if key not in ("operator", "negatives", "horizon") or key in options:
+            raise ValueError(f"{word!r} is no operator, 'negatives' or 'horizon=k', each once only: {text!r}")
+        options[key] = int(horizon[1]) if horizon else word if key == "operator" else True
+    return options
 
 
 def search_space_size(max_horizon: int = 10) -> int:

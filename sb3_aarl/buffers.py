@@ -276,22 +276,6 @@ class WindowReplayBuffer(NStepReplayBuffer):
             starts |= ~rows_equal(current[key], last)
         return starts
 
-    @property
-    def stacks(self) -> bool:
-        """Whether any observation is a stack of frames."""
-        return any(store.stack > 1 for store in self.stores.values())
-
-    def can_go_on(self, obs: np.ndarray | dict[str, np.ndarray]) -> bool:
-        """
-        Whether the frames of these observations are known: each is what the last transition led to, or begins an episode. A
-        buffer that was emptied or exchanged inside an episode has not the earlier frames of a stack.
-
-        :param obs: Observations of all envs
-        """
-        current = self._by_key(obs)
-        starts = self._starts(current)
-        return all(store.begins(current[key])[starts].all() for key, store in self.stores.items())
-
     def training_state(self) -> dict[str, Any]:
         """Tensors and plain values of what was added, for ``load_training_state``; they share memory with the buffer."""
         return {

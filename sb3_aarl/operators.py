@@ -4,39 +4,6 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_aarl.aux_loss import OPERATORS
-
-
-def squared_error(prediction: th.Tensor, target: th.Tensor, negatives: bool) -> th.Tensor:
-    """
-    Mean squared error; with negatives, minus the same error against another row of the batch.
-
-    The other row is the previous one: a batch is drawn independently, so any fixed permutation without a fixed point
-    is as good as a random one. For a batch of one row it is zero.
-
-    :param prediction: (batch, d) floats
-    :param target: (batch, d) floats
-    :param negatives: Whether to push predictions away from other rows' targets
-    """
-    loss = F.mse_loss(prediction, target)
-    if negatives:
-        loss = loss - F.mse_loss(prediction, target.roll(1, dims=0))
-    return loss
-
-
-def cross_entropy(similarity: th.Tensor, negatives: bool) -> th.Tensor:
-    """
-    InfoNCE: cross entropy of row i of the similarity matrix against column i (equation 3 with the sign of a loss).
-
-    Without negatives the matrix keeps its diagonal only, with zeros elsewhere.
-
-    :param similarity: (batch, batch), the similarity of prediction i and target j
-    :param negatives: Whether the elements off the diagonal count
-    """
-    if not negatives:
-        similarity = th.diag(th.diagonal(similarity))
-    return F.cross_entropy(similarity, th.arange(len(similarity), device=similarity.device))
-
 
 class Operator(nn.Module):
     """
@@ -52,8 +19,6 @@ class Operator(nn.Module):
 
     def __init__(self, name: str, negatives: bool, dim: int):
         super().__init__()
-        if name not in OPERATORS:
-            raise ValueError(f"unknown operator {name!r}, expected one of {', '.join(OPERATORS)}")
         self.name = name
         self.negatives = negatives
         if name == "bilinear":
@@ -63,7 +28,13 @@ class Operator(nn.Module):
         if self.name in ("n_mse", "cosine"):
             prediction, target = F.normalize(prediction, dim=1), F.normalize(target, dim=1)
         if self.name in ("mse", "n_mse"):
-            return squared_error(prediction, target, self.negatives)
+            loss = F.mse_loss(prediction, target)
+            # Another row is the previous one: a batch is drawn independently, so any fixed permutation will do.
+            return loss - F.mse_loss(prediction, target.roll(1, dims=0)) if self.negatives else loss
         if self.name == "bilinear":
             prediction = prediction @ self.weight
-        return cross_entropy(prediction @ target.T, self.negatives)
+        # InfoNCE, equation 3 with the sign of a loss; without negatives the matrix keeps its diagonal, with zeros elsewhere.
+        similarity = prediction @ target.T
+        if not self.negatives:
+            similarity = th.diag(th.diagonal(similarity))
+        return F.cross_entropy(similarity, th.arange(len(similarity), device=similarity.device))

@@ -94,11 +94,6 @@ def read_trunk(features_extractor: BaseFeaturesExtractor, obs: Any) -> th.Tensor
     return features_extractor.trunk(obs) if has_parts(features_extractor) else features_extractor(obs)
 
 
-def full_precision(x: th.Tensor) -> th.Tensor:
-    """Output of a network as float32 where it computed in bfloat16."""
-    return x.float() if x.dtype == th.bfloat16 else x
-
-
 class Trunk(NamedTuple):
     """
     Stands for observations whose encoding is known up to the projection: computed once for actor and critic.
@@ -181,9 +176,9 @@ class Actor(_CropsImages, SB3Actor):
 
     def action_log_prob(self, obs: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
         mean_actions, log_std, kwargs = self.get_action_dist_params(obs)  # type: ignore[arg-type]
-        kwargs = {name: full_precision(value) for name, value in kwargs.items()}
+        kwargs = {name: value.float() for name, value in kwargs.items()}
         with th.autocast(mean_actions.device.type, enabled=False):
-            return self.action_dist.log_prob_from_params(full_precision(mean_actions), full_precision(log_std), **kwargs)
+            return self.action_dist.log_prob_from_params(mean_actions.float(), log_std.float(), **kwargs)
 
 
 class Critic(_CropsImages, ContinuousCritic):
@@ -222,7 +217,7 @@ class Critic(_CropsImages, ContinuousCritic):
         :return: (batch, features_dim)
         """
         values = obs.values if isinstance(obs, Trunk) else self.trunk(obs).values
-        return full_precision(self.features_extractor.project(values) if has_parts(self.features_extractor) else values)
+        return (self.features_extractor.project(values) if has_parts(self.features_extractor) else values).float()
 
     def q_values(self, latent: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
@@ -233,7 +228,7 @@ class Critic(_CropsImages, ContinuousCritic):
         :return: One (batch, 1) for each critic
         """
         inputs = th.cat([latent, actions], dim=1)
-        return tuple(full_precision(q_network(inputs)) for q_network in self.q_networks)
+        return tuple(q_network(inputs).float() for q_network in self.q_networks)
 
     @cached_property
     def q_parameters(self) -> list[nn.Parameter]:

@@ -553,14 +553,10 @@ class SACAux(SAC):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfSACAux:
-        buffer = self.replay_buffer
-        if isinstance(buffer, WindowReplayBuffer) and self._last_obs is not None and not reset_num_timesteps:
-            obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
-            assert obs is not None
-            # Emptied or replaced since, or a callback ended learn() before the last transition was stored.
-            if buffer.stacks and (self._stored_timesteps != self.num_timesteps or not buffer.can_go_on(obs)):
-                logger.warning("the replay buffer lacks frames of the running episodes: the environments are reset")
-                self._last_obs = None
+        if not reset_num_timesteps and self._stored_timesteps != self.num_timesteps:
+            self._last_obs = (
+                None  # a callback ended learn() before the last transition was stored: SB3 resets the environments
+            )
         try:
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         except ValueError as error:

@@ -66,8 +66,7 @@ def test_tokens_are_the_bits_of_the_masks(loss: AuxLoss) -> None:
     source, target = as_sets(loss)
     assert set(loss.source_tokens) == source and set(loss.target_tokens) == target
     for tokens in (loss.source_tokens, loss.target_tokens):
-        assert [token.index for token in tokens] == sorted(token.index for token in tokens)
-        assert all(Token.of(token.index) == token for token in tokens)
+        assert list(tokens) == [Token.of(i) for i in range(3 * loss.horizon + 1) if Token.of(i) in tokens]
     longer = AuxLoss.from_tokens(loss.source_tokens, loss.target_tokens, loss.operator, loss.negatives, loss.horizon)
     assert longer == loss
     shortest = AuxLoss.from_tokens(loss.source_tokens, loss.target_tokens)
@@ -145,35 +144,30 @@ def test_arguments_and_brackets() -> None:
     text = "{s_t} -> {s_t}"
     assert AuxLoss.parse(text, "inner", True, 3) == AuxLoss.parse(f"{text} [negatives, horizon=3, inner]")
     assert AuxLoss.parse(f"{text} [n_mse]", negatives=True, horizon=2) == AuxLoss.parse(text, "n_mse", True, 2)
-    with pytest.raises(ValueError, match=r"operator is 'inner', but the notation says 'cosine'"):
-        AuxLoss.parse(f"{text} [cosine]", "inner")
-    with pytest.raises(ValueError, match=r"horizon is 2, but the notation says 3"):
-        AuxLoss.parse(f"{text} [horizon=3]", horizon=2)
+    assert AuxLoss.parse(f"{text} [cosine, horizon=3]", "inner", horizon=2) == AuxLoss.parse(text, "cosine", horizon=3)
 
 
 @pytest.mark.parametrize(
-    "text, position, expected",
+    "text, problem",
     [
-        ("", 0, "'{'"),
-        ("s_t -> s_t+1", 0, "'{'"),
-        ("{x_t} -> {s_t}", 1, "a token"),
-        ("{,s_t} -> {s_t}", 1, "a token"),
-        ("{s_t+} -> {s_t}", 4, "',' or '}'"),
-        ("{s_{t+1} -> {s_t}", 9, "',' or '}'"),
-        ("{s_t, s_{t+0}} -> {s_t}", 6, "s_t once only"),
-        ("{s_t} {s_t}", 6, "'->'"),
-        ("{s_t} -> {s_t", 13, "',' or '}'"),
-        ("{s_t} -> {s_t} -> {s_t}", 15, "nothing more"),
-        ("{s_t} -> {s_t} [mse", 15, "nothing more"),
-        ("{s_t} -> {s_t} [huber]", 15, "an operator, .* instead of 'huber'"),
-        ("{s_t} -> {s_t} [mse, cosine]", 15, "an operator, .* each once only, instead of 'cosine'"),
+        ("", "a notation is a text such as .*, not ''"),
+        ("s_t -> s_t+1", "a notation is"),
+        ("{s_{t+1} -> {s_t}", "a notation is"),
+        ("{s_t} {s_t}", "a notation is"),
+        ("{s_t} -> {s_t", "a notation is"),
+        ("{s_t} -> {s_t} -> {s_t}", "a notation is"),
+        ("{s_t} -> {s_t} [mse", "a notation is"),
+        ("{x_t} -> {s_t}", "'x_t' is no token"),
+        ("{,s_t} -> {s_t}", "'' is no token"),
+        ("{s_t+} -> {s_t}", r"'s_t\+' is no token"),
+        ("{s_t} -> {s_t} [huber]", "'huber' is no operator"),
+        ("{s_t} -> {s_t} [mse, cosine]", "'cosine' is .* each once only"),
+        ("{s_t} -> {s_t} []", "'' is no operator"),
     ],
 )
-def test_what_cannot_be_read_says_where(text: str, position: int, expected: str) -> None:
-    with pytest.raises(ValueError, match=rf"^expected {expected}.* at position {position}, found ") as error:
+def test_what_cannot_be_read_is_named(text: str, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
         AuxLoss.parse(text)
-    found = repr(text[position : position + 10]) if position < len(text) else "the end"
-    assert f"found {found}: " in str(error.value)
 
 
 YES, NO = (True, False, False, False), (False,) * 4
@@ -261,5 +255,4 @@ def test_any_text_is_a_loss_or_a_value_error(text: str) -> None:
 def test_search_space_size() -> None:
     # Appendix C, 10 * (2^8 + 2^14 + ... + 2^62), worked out as a geometric series; the paper rounds it down to 4.6e19.
     assert search_space_size() == search_space_size(10) == 2560 * (64**10 - 1) // 63 == 46848873837992512000
-    assert isinstance(search_space_size(10), int)
     assert search_space_size(1) == 2560

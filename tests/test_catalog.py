@@ -107,7 +107,7 @@ def test_resolve() -> None:
     loss = AuxLoss.parse("{s_t} -> {s_t+1} [cosine, negatives]")
     for value in (loss, str(loss), loss.to_dict(), {"loss": str(loss)}):
         assert catalog.resolve(value) == loss
-    with pytest.raises(ValueError, match="at position 0"):
+    with pytest.raises(ValueError, match="a notation is"):
         catalog.resolve("s_t -> s_t+1")
     with pytest.raises(ValueError, match="not 3"):
         catalog.resolve(3)  # type: ignore[arg-type]

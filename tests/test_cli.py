@@ -152,7 +152,7 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
         (["cartpole-blance"], "nearest: cartpole-balance"),
         (["own_env:Own-v0"], "'own_env' as one of the imports"),
         (["Pendulum-v1", "--aux-loss", "curll"], "nearest: curl"),
-        (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "position 10"),
+        (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "'q_t' is no token"),
         (["Pendulum-v1", "--steps", "3", "--evaluations", "5"], "too few"),
         (["Pendulum-v1", "--config", "simba/sac_simbaa"], "nearest: simba/sac_simba"),
         (["CartPole-v1", "--steps", "1000"], "CartPole-v1 cannot be trained"),

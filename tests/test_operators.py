@@ -113,8 +113,3 @@ def test_the_weight_of_bilinear_starts_as_in_curl() -> None:
     weight = Operator("bilinear", True, 200).weight
     assert weight.shape == (200, 200) and weight.min() >= 0 and weight.max() < 1
     assert weight.mean().item() == pytest.approx(0.5, abs=0.01)
-
-
-def test_unknown_operator() -> None:
-    with pytest.raises(ValueError, match="unknown operator 'huber', expected one of inner, bilinear, cosine, mse, n_mse"):
-        Operator("huber", False, 3)

@@ -203,7 +203,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "body/default_simba_64_entropy_no_aux_bf16": FINALIST | {"aux_loss": None},
     "body/default_simba_32_entropy_bf16": simba(32) | ENTROPY,
     "aarl_simba": FINALIST,
-    "simba/aarl_simba_repeat_4": FINALIST,
+    "simba/forward_simba_repeat_4": FINALIST | {"aux_loss": "forward-dynamics"},
     "simba/forward_simba": FINALIST | {"aux_loss": "forward-dynamics"},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/aarl_dense_mlp": PAPERS,
