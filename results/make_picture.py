@@ -9,10 +9,10 @@ from search.studies.benchmark import read_curves
 
 RESULTS = Path(__file__).parent
 FOLDERS = ("simba_cheetah_run", "simba", "choices_small")
-# What the picture calls each variant. All have action repeat 4; aarl_simba has it on Cheetah-Run only.
+# What the picture calls each variant. All have action repeat 4; forward_simba has it on Cheetah-Run only.
 VARIANTS = {
-    "aarl_simba": "SACAux, AARL-State, encoder simba",
-    "aarl_simba_repeat_4": "SACAux, AARL-State, encoder simba",
+    "forward_simba": "SACAux, forward dynamics, encoder simba",
+    "forward_simba_repeat_4": "SACAux, forward dynamics, encoder simba",
     "aarl_state_small": "SACAux, AARL-State, the paper's encoder",
     "sac_dense_mlp_small": "the same without auxiliary loss",
     "sac_identity_small": "SAC on the states",
@@ -28,7 +28,7 @@ PUBLISHED = {
 def main() -> None:
     curves = pd.concat(read_curves(RESULTS / folder) for folder in FOLDERS)
     curves = curves[curves["variant"].isin(VARIANTS) & curves["env"].isin(PUBLISHED)]
-    curves = curves[(curves["variant"] != "aarl_simba") | (curves["env"] == "cheetah-run")]
+    curves = curves[(curves["variant"] != "forward_simba") | (curves["env"] == "cheetah-run")]
     curves["variant"] = pd.Categorical(curves["variant"].map(VARIANTS), list(dict.fromkeys(VARIANTS.values())))
     figure = learning_curves_plot(curves.sort_values(["env", "variant"]))
     for axes in figure.axes:

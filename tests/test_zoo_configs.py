@@ -123,7 +123,7 @@ def tasks_of(variant: str) -> tuple[str, ...]:
 
 
 def test_the_variants_are_all_there() -> None:
-    assert {path.stem for path in ZOO.glob("*.yml")} == {*VARIANTS, "aarl_simba", "default", "demo", "sac"}
+    assert {path.stem for path in ZOO.glob("*.yml")} == {*VARIANTS, "forward_simba", "default", "demo", "sac"}
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -202,11 +202,12 @@ BODIES: dict[str, dict[str, Any]] = {
     "body/default_simba_64_entropy_bf16": FINALIST,
     "body/default_simba_64_entropy_no_aux_bf16": FINALIST | {"aux_loss": None},
     "body/default_simba_32_entropy_bf16": simba(32) | ENTROPY,
-    "aarl_simba": FINALIST,
+    "simba/aarl_simba": FINALIST,
     "simba/forward_simba_repeat_4": FINALIST | {"aux_loss": "forward-dynamics"},
-    "simba/forward_simba": FINALIST | {"aux_loss": "forward-dynamics"},
+    "forward_simba": FINALIST | {"aux_loss": "forward-dynamics"},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/aarl_dense_mlp": PAPERS,
+    "simba/forward_dense_mlp": PAPERS | {"aux_loss": "forward-dynamics"},
     "simba/dense_mlp_alone": PAPERS | {"aux_loss": None},
     "simba/aarl_simba_heads": with_policy(FINALIST, **BLOCKS),
     "simba/aarl_dense_mlp_heads": with_policy(PAPERS, **BLOCKS),
@@ -223,7 +224,7 @@ BODIES: dict[str, dict[str, Any]] = {
 def test_bodies_differ_from_the_defaults_in_nothing_else() -> None:
     defaults = load_hyperparameters(ZOO / "default.yml", "MyEnv-v0")
     folders = [path.relative_to(ZOO).with_suffix("").as_posix() for path in ZOO.glob("*/*.yml")]
-    assert {name for name in folders if name.startswith(("body/", "simba/"))} | {"aarl_simba"} == BODIES.keys()
+    assert {name for name in folders if name.startswith(("body/", "simba/"))} | {"forward_simba"} == BODIES.keys()
     for name, changes in BODIES.items():
         path = ZOO / f"{name}.yml"
         for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
