@@ -187,25 +187,25 @@ def test_defaults_are_what_was_decided() -> None:
 def test_figures_of_the_first_readme() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     variants = [f"{name}_small" for name in ("sac_identity", "sac_dense_mlp", "aarl_state")]
-    simba = {
-        "cheetah-run": last_returns("aarl_simba", folder="simba_cheetah_run"),
-        "walker-walk": last_returns("aarl_simba_repeat_4", "walker-walk", "simba"),
+    forward = {
+        "cheetah-run": last_returns("forward_simba", folder="simba_cheetah_run"),
+        "walker-walk": last_returns("forward_simba_repeat_4", "walker-walk", "simba"),
     }
     for row, task in (("Cheetah-Run", "cheetah-run"), ("Walker-Walk", "walker-walk")):
-        runs = [*(last_returns(variant, task) for variant in variants), simba[task]]
+        runs = [*(last_returns(variant, task) for variant in variants), forward[task]]
         assert " | ".join([row, *map(shown, runs)]) in readme
-        assert [len(some) for some in runs] == [5, 3, 3, 10 if task == "cheetah-run" else 3]
+        assert [len(some) for some in runs[:3]] == [5, 3, 3]
+    assert f"in the last column {len(forward['cheetah-run'])} and {len(forward['walker-walk'])}:" in readme
     for row, names in (
-        ("the paper's encoder", ("dense_mlp_alone", "aarl_dense_mlp")),
-        ("`simba`", ("sac_simba", "aarl_simba")),
+        ("the paper's encoder", ("dense_mlp_alone", "aarl_dense_mlp", "forward_dense_mlp")),
+        ("`simba`", ("sac_simba", "aarl_simba", "forward_simba")),
     ):
         means = [f"{statistics.mean(last_returns(name, folder='simba_cheetah_run')):.0f}" for name in names]
         assert " | ".join([row, *means]) in readme
-    for text, task in (("Reacher-Hard ({})", "reacher-hard"), ("Finger-Spin ({})", "finger-spin")):
-        assert text.format(f"{statistics.mean(last_returns('aarl_simba', task, 'simba')):.0f}") in readme
-    iqm = interquartile_means(read_runs(RESULTS / "simba_cheetah_run")).set_index("variant").loc["aarl_simba"]
-    interval = f"interquartile mean of ten seeds not used for tuning, 95 % interval {iqm['low']:.0f} to {iqm['high']:.0f}"
-    assert f"{iqm['iqm']:.0f} ({interval})" in readme and iqm["runs"] == 10
+    assert f"ours {statistics.mean(last_returns('forward_simba', 'reacher-hard', 'simba')):.0f})" in readme
+    iqm = interquartile_means(read_runs(RESULTS / "simba_cheetah_run")).set_index("variant").loc["forward_simba"]
+    interval = f"interquartile mean of {iqm['iqm']:.0f}, 95 % interval {iqm['low']:.0f} to {iqm['high']:.0f}, of ten seeds"
+    assert interval in readme and iqm["runs"] == 10
     paper = paper_scores(4).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'").set_index("column")
     for text, variant, column in (
         ("AARL-State gets {} on Cheetah-Run, where the paper has {}", "aarl_state_bf16", "AARL-State"),
