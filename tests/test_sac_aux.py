@@ -483,6 +483,9 @@ def test_schedules_and_aux_coef() -> None:
     assert model.ent_coef_optimizer.param_groups[0]["lr"] == pytest.approx(1e-2 * model._current_progress_remaining**2)
     assert model.ent_coef_optimizer.param_groups[0]["betas"] == (0.3, 0.99)
     assert model.critic.optimizer.param_groups[0]["lr"] == 1e-3
+    for delay in (1, 3):
+        model = make_model(learning_rate=lambda left: 1e-3 + left, policy_delay=delay).learn(10)
+        assert model.ent_coef_optimizer.param_groups[0]["lr"] == delay * model.actor.optimizer.param_groups[0]["lr"]
 
     norms = []
     for coefficient in (0.0, 1.0, 3.0):
