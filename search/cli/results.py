@@ -199,6 +199,6 @@ def dashboard(
         study = load_study(opened, name)
         if SETTINGS_KEY in study.user_attrs:  # a search; baselines may have been trained since its last plot
             update_plots(study, stored_baselines(Path("runs") / name if path is None or name != path.name else path))
-    say(f"http://{host}:{port}/  (Ctrl-C to stop)")
+    say(f"http://{host}:{port}/  (Ctrl-C to stop; --port for another port)")
     with suppress(KeyboardInterrupt):
         run_server(opened, host=host, port=port)

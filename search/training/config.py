@@ -76,7 +76,8 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     """
     entries = read_yaml(path)
     if not {"default", env_id} & entries.keys():
-        raise ConfigError(f"{path}: neither {env_id!r} nor 'default' is there, under which hyper-parameters stand")
+        hint = ": it is the file of a search" if "environment" in entries else ", under which hyper-parameters stand"
+        raise ConfigError(f"{path}: neither {env_id!r} nor 'default' is there{hint}")
     merged: dict[str, Any] = {}
     for name in ("default", env_id):
         entry = entries.get(name, {})
