@@ -3,8 +3,8 @@ What one gradient step costs: SACAux beside SB3's SAC with networks of the same 
 
 All run in one process and take turns, so that what disturbs the machine disturbs all; ratios are medians of the ratios
 within each round. ``state``: observations and actions of Cheetah-Run, batch 512, two hidden layers of 1024, AARL-State.
-``small``: the same with SB3's sizes, batch 256 and two hidden layers of 256, on one thread; ``simba`` with that encoder and forward
-dynamics.
+``small``: the same with SB3's sizes, batch 256 and two hidden layers of 256, on one thread; ``simba`` with that encoder and
+forward dynamics.
 ``pixels``: three stacked frames of 100 x 100 x 3 cropped to 84 x 84, batch 128, AARL-Pixel. SB3's SAC reads pixels of
 84 x 84 through the same encoder class, so that both do the same convolutions. The replay buffers hold random numbers:
 a gradient step costs the same whatever they mean.
