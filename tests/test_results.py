@@ -203,6 +203,8 @@ def test_figures_of_the_first_readme() -> None:
         means = [f"{statistics.mean(last_returns(name, folder='simba_cheetah_run')):.0f}" for name in names]
         assert " | ".join([row, *means]) in readme
     assert f"ours {statistics.mean(last_returns('forward_simba', 'reacher-hard', 'simba')):.0f})" in readme
+    walks = " and ".join(f"{value:.0f}" for value in last_returns("forward_simba", "walker-walk", "simba"))
+    assert f"With action repeat 2 ours gets {walks} on Walker-Walk" in readme
     iqm = interquartile_means(read_runs(RESULTS / "simba_cheetah_run")).set_index("variant").loc["forward_simba"]
     interval = f"interquartile mean of {iqm['iqm']:.0f}, 95 % interval {iqm['low']:.0f} to {iqm['high']:.0f}, of ten seeds"
     assert interval in readme and iqm["runs"] == 10
