@@ -120,9 +120,9 @@ class AuxLoss:
         ``{s_t} -> {s_t} [bilinear, negatives, horizon=2]``.
 
         :param text: The notation
-        :param operator: As in the class, unless brackets in the text have another
-        :param negatives: As in the class, unless brackets in the text have it
-        :param horizon: None for the smallest that holds all tokens, unless brackets in the text have it
+        :param operator: As in the class; brackets in the text win over the default
+        :param negatives: As in the class; brackets in the text win over the default
+        :param horizon: None for the smallest that holds all tokens
         :raises ValueError: naming what cannot be read, or the rule that the loss breaks
         """
         plain = re.sub(r"[\s$\\]", "", re.sub(r"\\(rightarrow|to)(?![a-zA-Z])|→", "->", str(text)))
@@ -130,7 +130,11 @@ class AuxLoss:
         if match is None:
             raise ValueError(f"a notation is a text such as '{{s_t, a_t}} -> {{s_t+1}}', not {text!r}")
         options = {"operator": operator, "negatives": negatives, "horizon": horizon}
-        options |= {} if match[3] is None else _options(match[3], text)
+        unset = {"operator": "mse", "negatives": False, "horizon": None}
+        for key, value in _options(match[3], text).items() if match[3] is not None else ():
+            if options[key] not in (unset[key], value):
+                raise ValueError(f"{key} is {options[key]!r}, but the notation says {value!r}: {text!r}")
+            options[key] = value
         return cls.from_tokens(_tokens(match[1], text), _tokens(match[2], text), **options)  # type: ignore[arg-type]
 
     @property
@@ -204,12 +208,15 @@ def _checked_horizon(horizon: Any) -> int:
 
 def _tokens(words: str, text: str) -> list[Token]:
     """The tokens between two braces."""
-    tokens = []
+    tokens: list[Token] = []
     for word in words.split(",") if words else []:
         match = _TOKEN.fullmatch(word)
         if match is None:
             raise ValueError(f"{word!r} is no token such as s_t, a_t+1 or r_t+2: {text!r}")
-        tokens.append(Token(match[1], int(match[2] or 0)))
+        token = Token(match[1], int(match[2] or 0))
+        if token in tokens:
+            raise ValueError(f"{token} is there twice: {text!r}")
+        tokens.append(token)
     return tokens
 
 

@@ -346,16 +346,11 @@ class SACAux(SAC):
 
     def _update_learning_rates(self) -> None:
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-        others = (
-            (self.ent_coef_optimizer, self._ent_coef_schedule),
-            (
-                self.aux_optimizer,
-                self._schedule(self.encoder_learning_rate),
-            ),
-        )
-        for optimizer, schedule in others:
-            if optimizer is not None:
-                update_learning_rate(optimizer, schedule(self._current_progress_remaining))
+        progress_remaining = self._current_progress_remaining
+        if self.ent_coef_optimizer is not None:
+            update_learning_rate(self.ent_coef_optimizer, self._ent_coef_schedule(progress_remaining))
+        if self.aux_optimizer is not None:
+            update_learning_rate(self.aux_optimizer, self._schedule(self.encoder_learning_rate)(progress_remaining))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Batch norm and dropout of the networks that learn; the target critic stays in evaluation mode.

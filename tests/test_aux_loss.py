@@ -144,7 +144,10 @@ def test_arguments_and_brackets() -> None:
     text = "{s_t} -> {s_t}"
     assert AuxLoss.parse(text, "inner", True, 3) == AuxLoss.parse(f"{text} [negatives, horizon=3, inner]")
     assert AuxLoss.parse(f"{text} [n_mse]", negatives=True, horizon=2) == AuxLoss.parse(text, "n_mse", True, 2)
-    assert AuxLoss.parse(f"{text} [cosine, horizon=3]", "inner", horizon=2) == AuxLoss.parse(text, "cosine", horizon=3)
+    with pytest.raises(ValueError, match=r"operator is 'inner', but the notation says 'cosine'"):
+        AuxLoss.parse(f"{text} [cosine]", "inner")
+    with pytest.raises(ValueError, match=r"horizon is 2, but the notation says 3"):
+        AuxLoss.parse(f"{text} [horizon=3]", horizon=2)
 
 
 @pytest.mark.parametrize(
@@ -160,6 +163,7 @@ def test_arguments_and_brackets() -> None:
         ("{x_t} -> {s_t}", "'x_t' is no token"),
         ("{,s_t} -> {s_t}", "'' is no token"),
         ("{s_t+} -> {s_t}", r"'s_t\+' is no token"),
+        ("{s_t, s_{t+0}} -> {s_t}", "s_t is there twice"),
         ("{s_t} -> {s_t} [huber]", "'huber' is no operator"),
         ("{s_t} -> {s_t} [mse, cosine]", "'cosine' is .* each once only"),
         ("{s_t} -> {s_t} []", "'' is no operator"),
@@ -255,4 +259,5 @@ def test_any_text_is_a_loss_or_a_value_error(text: str) -> None:
 def test_search_space_size() -> None:
     # Appendix C, 10 * (2^8 + 2^14 + ... + 2^62), worked out as a geometric series; the paper rounds it down to 4.6e19.
     assert search_space_size() == search_space_size(10) == 2560 * (64**10 - 1) // 63 == 46848873837992512000
+    assert isinstance(search_space_size(10), int)
     assert search_space_size(1) == 2560

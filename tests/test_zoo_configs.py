@@ -180,9 +180,9 @@ def test_choices_differ_in_nothing_else() -> None:
             assert load_hyperparameters(path, env_id) == merge(load_hyperparameters(ZOO / f"{variant}.yml", env_id), changes)
 
 
-def simba(width: int, **kwargs: Any) -> dict[str, Any]:
+def simba(width: int) -> dict[str, Any]:
     extractor = {"features_extractor_class": "simba", "features_extractor_kwargs": {"features_dim": width}}
-    return {"precision": "bf16", "policy_kwargs": extractor | kwargs}
+    return {"precision": "bf16", "policy_kwargs": extractor}
 
 
 def with_policy(values: dict[str, Any], **kwargs: Any) -> dict[str, Any]:

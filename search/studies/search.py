@@ -38,7 +38,7 @@ def make_run(
         aux_loss=None if aux_loss is None else str(aux_loss),
         hyperparameters=hyperparameters,
         seed=seed,
-        checkpoints=tuple(config.checkpoints),
+        checkpoints=config.checkpoints,
         evaluation_episodes=config.evaluation_episodes,
         threads=config.threads,
         imports=tuple(config.imports),
