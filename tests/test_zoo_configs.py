@@ -215,6 +215,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba/aarl_simba_unnormalized": with_policy(FINALIST, features_extractor_kwargs={"normalize": False}),
     "simba/aarl_dense_mlp_normalized": PAPERS | {"normalize": {"norm_reward": False}},
     "simba/aarl_simba_two_steps": FINALIST | {"gradient_steps": 2},
+    "simba/aarl_simba_one_critic": with_policy(FINALIST, n_critics=1),
     "simba/aarl_simba_weight_decay": with_policy(
         FINALIST, optimizer_kwargs={"weight_decay": 0.01, "decoupled_weight_decay": True}
     ),
