@@ -4,6 +4,7 @@ RL-Zoo's own programs with SACAux, as ``sac_aux``, and with DeepMind Control as 
     python -m sb3_aarl.rl_zoo train --algo sac_aux --env dm_control/cheetah-run-v0 -conf zoo_configs/aarl_state.yml
     python -m sb3_aarl.rl_zoo enjoy --algo sac_aux --env dm_control/cheetah-run-v0 -f logs
     python -m sb3_aarl.rl_zoo record_video --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
+    python -m sb3_aarl.rl_zoo record_training --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
     python -m sb3_aarl.rl_zoo plot_train -a sac_aux -e dm_control/cheetah-run-v0 -f logs
     python -m sb3_aarl.rl_zoo all_plots -a sac_aux sac -e dm_control/cheetah-run-v0 -f logs -o curves
     python -m sb3_aarl.rl_zoo plot_from_file -i curves
@@ -20,6 +21,7 @@ import argparse
 import functools
 import importlib
 import runpy
+import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.resources import files
@@ -32,13 +34,12 @@ import yaml
 from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env  # first: it chooses the renderer
 from sb3_aarl.sac_aux import SACAux
 
-# Functions in RL-Zoo's modules, each of its own name; the others are scripts. Two scripts are missing: record_training starts
-# processes of record_video, which do not know SACAux; push_to_hub of RL-Zoo 2.9.2 fails for all algorithms, as it imports a
-# function that sb3-team-hf-integration 3.2 does not have.
+# Functions in RL-Zoo's modules, each of its own name; the others are scripts. push_to_hub is missing: RL-Zoo 2.9.2's fails for
+# all algorithms, as it imports a function that sb3-team-hf-integration 3.2 does not have.
 FUNCTIONS = {"train": "rl_zoo3.train", "enjoy": "rl_zoo3.enjoy"} | dict.fromkeys(
     ("plot_train", "all_plots", "plot_from_file"), "rl_zoo3.plots"
 )
-PROGRAMS = (*FUNCTIONS, "record_video", "load_from_hub")
+PROGRAMS = (*FUNCTIONS, "record_video", "record_training", "load_from_hub")
 
 
 def register() -> None:
@@ -121,6 +122,11 @@ def main() -> None:
         known, arguments = packages.parse_known_args(arguments)
         for name in known.gym_packages:
             importlib.import_module(name)
+    elif program == "record_training":
+        # It starts a process of record_video for each model: ours, which knows SACAux.
+        call = subprocess.call
+        ours = [sys.executable, "-m", "sb3_aarl.rl_zoo", "record_video"]
+        subprocess.call = lambda command: call([*ours, *command[3:]])  # type: ignore[assignment, misc]
     elif program in ("plot_train", "all_plots"):
         # They look for folders, in whose names RL-Zoo has a dash for the slash.
         arguments = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]

@@ -98,6 +98,17 @@ def test_enjoy_record_video_and_plots(trained: Path) -> None:
     assert printed.endswith("[1]\n")  # one curve, of one episode
 
 
+@pytest.mark.slow
+def test_records_training(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="pip install 'sb3-aarl[zoo]'").get_ffmpeg_exe()
+    (tmp_path / "ffmpeg").symlink_to(ffmpeg)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    program = ["-m", "sb3_aarl.rl_zoo", "record_training", *SAC_AUX, "-n", "3"]
+    run(tmp_path, *program, "-f", str(trained.parents[1]), "-o", str(tmp_path / "videos"))
+    names = sorted(path.name.partition("-sac_aux")[0] for path in (tmp_path / "videos").iterdir())
+    assert names == ["best-model", "final-model", "training.mp4"]
+
+
 MY_ENVS = """
 import gymnasium as gym
 import numpy as np
