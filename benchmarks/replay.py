@@ -54,7 +54,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--transitions", type=int, default=10_000, help="length of both rings (SB3's takes 180 kB each)")
     parser.add_argument("--rounds", type=int, default=25)
-    parser.add_argument("--device", default="cpu", help="device of the samples, and of the frames in the last row if not cpu")
+    parser.add_argument("--device", default="cpu", help="device of the samples")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
@@ -67,10 +67,6 @@ def main() -> None:
         "windows, whole": lambda: ours.sample_windows(BATCH, HORIZON),
         "transitions, cropped": lambda: ours.sample(BATCH * (HORIZON + 1) // 2, crop_size=CROP),
     }
-    if args.device != "cpu":
-        there = WindowReplayBuffer(args.transitions, IMAGES, ACTIONS, args.device, frame_stack=3, storage_device=args.device)
-        fill(there, args.transitions)
-        draws["windows, cropped, on the device"] = lambda: there.sample_windows(BATCH, HORIZON, crop_size=CROP)
 
     seconds: dict[str, list[float]] = {name: [] for name in draws}
     for i in range(args.rounds + 1):

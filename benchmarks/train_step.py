@@ -113,15 +113,12 @@ def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
     )
 
 
-def modes(setting: str, device: str) -> dict[str, dict[str, Any]]:
-    """The ways to run a gradient step on this device, by name."""
+def modes(setting: str) -> dict[str, dict[str, Any]]:
+    """The ways to run a gradient step, by name."""
     ways: dict[str, dict[str, Any]] = {"fp32": {}, "bf16": {"precision": "bf16"}}
     ways |= {f"{name}, compiled": {**kwargs, "compile": True} for name, kwargs in ways.items()}
     if setting == "small":
         ways |= {f"simba, {name}": {**kwargs, **SIMBA} for name, kwargs in ways.items()}
-    if device == "cuda":
-        on_gpu = {"replay_buffer_kwargs": {"storage_device": "cuda"}}
-        ways |= {f"{name}, storage": {**kwargs, **on_gpu} for name, kwargs in ways.items()}
     return ways
 
 
@@ -274,7 +271,7 @@ def main() -> None:
     rows, threads = [], th.get_num_threads()
     for setting in args.settings:
         th.set_num_threads(1 if setting == "small" else threads)
-        variants: dict[str, dict[str, Any]] = {"no auxiliary loss": {"aux_loss": None}, **modes(setting, args.device)}
+        variants: dict[str, dict[str, Any]] = {"no auxiliary loss": {"aux_loss": None}, **modes(setting)}
         steps = args.steps or (200 if args.device == "cuda" else STEPS[setting])
         rows += measure(setting, args.device, variants, args.rounds, steps, args.at_once)
         show(rows)

@@ -11,7 +11,6 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
-from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_aarl.augmentation import image_spaces
@@ -72,7 +71,7 @@ class _Observations:
         positions, envs = (np.asarray(part[index[:2]]) for part in grid)
         observations = self.buffer.gather(positions * self.buffer.n_envs + envs, self.following)
         part = observations[self.key] if isinstance(observations, dict) else observations
-        return part.cpu().numpy()[(*(slice(None),) * positions.ndim, *index[2:])]
+        return part.numpy()[(*(slice(None),) * positions.ndim, *index[2:])]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:], dtype)
@@ -98,8 +97,6 @@ class WindowReplayBuffer(NStepReplayBuffer):
     :param frame_stack: How many frames the environment stacks along the first axis of an observation, oldest first
         (channels of images, which SB3 puts first); one number, or one for each key of a Dict. At an episode's start
         the first frame may be repeated (Gymnasium's FrameStackObservation) or zeros may fill up (SB3's VecFrameStack)
-    :param storage_device: Device that observations are stored on, such as ``"cuda"``: they are then gathered and cropped
-        there. None for main memory. 100,000 frames of 100 x 100 x 3 bytes take 3 GB
     """
 
     def __init__(
@@ -114,7 +111,6 @@ class WindowReplayBuffer(NStepReplayBuffer):
         n_steps: int = 1,
         gamma: float = 0.99,
         frame_stack: int | Mapping[str, int] = 1,
-        storage_device: th.device | str | None = None,
     ):
         if n_steps > 1 and isinstance(observation_space, spaces.Dict):
             raise ValueError(f"n_steps={n_steps}: SB3 has no n-step returns for Dict observations")
@@ -131,14 +127,13 @@ class WindowReplayBuffer(NStepReplayBuffer):
         if not set(stacks) <= set(parts):
             raise ValueError(f"frame_stack={dict(stacks)} names keys that observations do not have: {sorted(parts)}")
         self._image_keys = list(image_spaces(observation_space))
-        storage_device = get_device(storage_device or "cpu")
         self.stores: dict[str, FrameStore] = {}
         for key, space in parts.items():
             shape: Any = get_obs_shape(space)
             stack = stacks.get(key, 1)
-            self.stores[key] = FrameStore(key, self.buffer_size, n_envs, shape, space.dtype, stack, storage_device)
+            self.stores[key] = FrameStore(key, self.buffer_size, n_envs, shape, space.dtype, stack)
         needed = sum(store.frames.nbytes for store in self.stores.values())
-        if psutil is not None and storage_device.type == "cpu" and needed > psutil.virtual_memory().available:
+        if psutil is not None and needed > psutil.virtual_memory().available:
             # As SB3 does: memory is taken as it fills, which may be hours later.
             warnings.warn(f"There is not enough memory for a replay buffer of {needed / 1e9:.2f} GB", stacklevel=2)
 
@@ -198,7 +193,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         }
         observations: Any = parts if isinstance(self.observation_space, spaces.Dict) else parts[""]
         if env is not None:
-            observations = env.normalize_obs(map_parts(lambda part: part.cpu().numpy(), observations))
+            observations = env.normalize_obs(map_parts(lambda part: part.numpy(), observations))
         return map_parts(th.as_tensor, observations)
 
     def add(  # type: ignore[override]
@@ -300,7 +295,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self.reset()
         self._count(state["n_added"])
         for name, values in state["arrays"].items():
-            getattr(self, name)[: len(values)] = values.cpu().numpy()
+            getattr(self, name)[: len(values)] = values.numpy()
         for key, store in self.stores.items():
             store.load_training_state(state["stores"][key])
         self._episode_over = np.array(state["episode_over"])

@@ -33,19 +33,9 @@ class FrameStore:
     :param shape: Shape of a stacked observation; frames are stacked along its first axis, oldest first
     :param dtype: Data type of observations
     :param stack: Number of frames in an observation
-    :param device: Device that the frames are stored on
     """
 
-    def __init__(
-        self,
-        key: str,
-        buffer_size: int,
-        n_envs: int,
-        shape: tuple[int, ...],
-        dtype: Any,
-        stack: int,
-        device: th.device | str = "cpu",
-    ):
+    def __init__(self, key: str, buffer_size: int, n_envs: int, shape: tuple[int, ...], dtype: Any, stack: int):
         if stack < 1 or (stack > 1 and (not shape or shape[0] % stack)):
             raise ValueError(f"frame_stack={stack} does not divide the first axis of observations of shape {shape}")
         self.key = key
@@ -54,20 +44,19 @@ class FrameStore:
         self.shape = shape
         self.dtype = np.dtype(dtype)
         self.stack = stack
-        self.device = device
         self.frame_shape = (shape[0] // stack, *shape[1:]) if stack > 1 else shape
         # Zeros of NumPy take memory as they are written to, those of PyTorch at once.
-        self.frames = th.from_numpy(np.zeros((buffer_size + stack, n_envs, *self.frame_shape), self.dtype)).to(device)
+        self.frames = th.from_numpy(np.zeros((buffer_size + stack, n_envs, *self.frame_shape), self.dtype))
         self.final_frames: dict[int, th.Tensor] = {}  # by flat index in (buffer_size, n_envs)
         self.zero_padded = np.zeros((buffer_size, n_envs), bool)  # whether zeros came before an episode's first frame
 
     def __getstate__(self) -> dict[str, Any]:
-        # Pickled tensors take several times their memory, and those of a GPU need one to be loaded.
-        return {**self.__dict__, "frames": self.frames.cpu().numpy()}
+        # Pickled tensors take several times their memory.
+        return {**self.__dict__, "frames": self.frames.numpy()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self.frames = th.from_numpy(state["frames"]).to(self.device)
+        self.frames = th.from_numpy(state["frames"])
 
     def split(self, observations: np.ndarray) -> np.ndarray:
         """
@@ -158,13 +147,13 @@ class FrameStore:
         :param final: Whether the newest frame is stored separately
         :param crop_size: Height and width in pixels that each observation is cropped to, at a random position of
             its own; the frames of a stack stay together. None for no crop
-        :return: (..., *shape), height and width those of the crop, on ``device``
+        :return: (..., *shape), height and width those of the crop
         """
         back = np.arange(self.stack)[::-1]
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
         numbers = th.from_numpy(rows * self.n_envs + (indices % self.n_envs)[..., None])
         if crop_size is None:
-            frames = self.frames.flatten(0, 1).index_select(0, numbers.flatten().to(self.device))
+            frames = self.frames.flatten(0, 1).index_select(0, numbers.flatten())
         else:
             top, left = (th.randint(length - crop_size + 1, newest.shape) for length in self.frame_shape[1:])
             frames = self._crops(numbers, top, left, crop_size)
@@ -197,7 +186,7 @@ class FrameStore:
         rows = ((numbers[..., None] * channels + th.arange(channels))[..., None] * height + th.arange(size)) * width
         starts = rows + (top * width + left)[..., None, None, None]
         pixels = self.frames.flatten().unfold(0, size, 1)  # ``size`` pixels from every one on, nothing copied yet
-        return pixels.index_select(0, starts.flatten().to(self.device)).view(-1, channels, size, size)
+        return pixels.index_select(0, starts.flatten()).view(-1, channels, size, size)
 
     def training_state(self, n_added: int) -> dict[str, th.Tensor]:
         """
@@ -205,12 +194,12 @@ class FrameStore:
         :return: What is stored, for ``load_training_state``; it shares memory with the store
         """
         # Through NumPy: torch.save writes all that a slice of a tensor is a part of.
-        frames = th.from_numpy(self.frames[: n_added + 1].cpu().numpy())
+        frames = th.from_numpy(self.frames[: n_added + 1].numpy())
         finals = list(self.final_frames.values()) or [th.empty(self.frame_shape, dtype=frames.dtype)]
         return {
             "frames": frames,
             "final_indices": th.tensor(list(self.final_frames), dtype=th.int64),
-            "final_frames": th.stack(finals)[: len(self.final_frames)].cpu(),
+            "final_frames": th.stack(finals)[: len(self.final_frames)],
             "zero_padded": th.from_numpy(self.zero_padded[:n_added]),
         }
 
@@ -219,8 +208,8 @@ class FrameStore:
         :param state: Of a store of the same settings
         """
         self.frames[: len(state["frames"])] = state["frames"]
-        self.zero_padded[: len(state["zero_padded"])] = state["zero_padded"].cpu().numpy()
-        pairs = zip(state["final_indices"].tolist(), state["final_frames"].to(self.device), strict=True)
+        self.zero_padded[: len(state["zero_padded"])] = state["zero_padded"].numpy()
+        pairs = zip(state["final_indices"].tolist(), state["final_frames"], strict=True)
         self.final_frames = {index: frame.clone() for index, frame in pairs}
 
 

@@ -804,17 +804,6 @@ def test_crops_are_parts_of_what_is_drawn_without(stack, as_dict):
     assert chisquare(counts).pvalue > 1e-3
 
 
-def test_frames_may_be_on_another_device():
-    """PyTorch's meta device has no values: whatever would copy them to main memory fails."""
-    drawn = []
-    for device in ("cpu", "meta"):
-        buffer = image_buffer(3, storage_device=device)
-        buffer.device = th.device(device)
-        drawn.append([*buffer.sample(50, crop_size=CROP), *buffer.sample_windows(50, 3)])
-    for here, there in zip(*drawn, strict=True):
-        assert here is None or (there.device.type, there.shape, there.dtype) == ("meta", here.shape, here.dtype)
-
-
 def test_a_class_of_a_users_own_may_have_sb3s_arguments():
     class Mine(WindowReplayBuffer):
         def _get_samples(self, batch_inds, env=None):

@@ -135,5 +135,5 @@ def test_adam_is_fused_unless_the_user_says_how(given: dict[str, Any]) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_on_a_gpu(kind: str, precision: str) -> None:
-    model = make_model(kind, device="cuda", precision=precision, replay_buffer_kwargs={"storage_device": "cuda"}).learn(60)
+    model = make_model(kind, device="cuda", precision=precision).learn(60)
     assert model._n_updates == 40 and np.isfinite(model.logger.name_to_value["train/aux_loss"])
