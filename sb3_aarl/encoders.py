@@ -216,18 +216,18 @@ class MultiInputEncoder(Encoder):
 
     :param observation_space: Dict of images and of anything that SB3 can flatten
     :param cnn_output_dim: Width of each image's latent state (table 7: 50; the name is SB3's CombinedExtractor's)
-    :param mlp_output_dim: Width of the other keys' latent state (table 8: 40)
+    :param mlp_output_dim: Width of the other keys' latent state
     :param normalized_image: Whether images are floats already, as in SB3's CombinedExtractor
-    :param vector_encoder: Encoder of the other keys: ``"dense_mlp"``, ``"mlp"`` or ``"simba"``
+    :param vector_encoder: Encoder of the other keys: ``"simba"``, ``"dense_mlp"`` or ``"mlp"``
     """
 
     def __init__(
         self,
         observation_space: spaces.Dict,
         cnn_output_dim: int = 50,
-        mlp_output_dim: int = 40,
+        mlp_output_dim: int = 64,
         normalized_image: bool = False,
-        vector_encoder: str = "dense_mlp",
+        vector_encoder: str = "simba",
     ):
         images = image_spaces(observation_space, normalized_image)
         vectors = {key: space for key, space in observation_space.spaces.items() if key not in images}

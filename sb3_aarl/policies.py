@@ -24,7 +24,7 @@ from sb3_aarl.augmentation import (
     random_shift,
     resolve_augmentation,
 )
-from sb3_aarl.encoders import DenseMLP, Encoder, MultiInputEncoder, PixelEncoder, encoder_class
+from sb3_aarl.encoders import Encoder, MultiInputEncoder, PixelEncoder, SimbaEncoder, encoder_class
 from sb3_aarl.networks import hidden_layers, orthogonal_init
 
 
@@ -272,7 +272,7 @@ class SACAuxPolicy(SACPolicy):
     critic: Critic
     critic_target: Critic
 
-    default_encoder: type[BaseFeaturesExtractor] = DenseMLP
+    default_encoder: type[BaseFeaturesExtractor] = SimbaEncoder
 
     def __init__(
         self,

@@ -52,10 +52,11 @@ class SACAux(SAC):
     The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The
     encoder of the target critic is the momentum encoder of the auxiliary loss. Arguments of SB3's SAC have its defaults,
     those of SACAux alone the paper's (tables 7 and 8) unless another source is named; all of the paper's values are in
-    ``zoo_configs/``. The entropy coefficient falls as fast as SAC's: at the paper's rate it takes too long to fall from SAC's
-    1 (HalfCheetah-v5, 30,000 steps, one and two seeds: 841; 4,750 and 4,382).
+    ``zoo_configs/``. From states encoder and loss are those that learnt fastest (``results/README.md``), not the paper's. The
+    entropy coefficient falls as fast as SAC's: at the paper's rate it takes too long to fall from SAC's 1 (DenseMLP,
+    AARL-State, HalfCheetah-v5, 30,000 steps, one and two seeds: 841; 4,750 and 4,382).
 
-    :param policy: ``"MlpPolicy"`` (DenseMLP encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
+    :param policy: ``"MlpPolicy"`` (``simba`` encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
     :param learning_rate: Of actor and critic, may be a schedule
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
@@ -85,8 +86,8 @@ class SACAux(SAC):
     :param device: Device of the networks
     :param aux_loss: An AuxLoss, its notation, a name of the catalogue, a YAML file such as a search's ``winner.yml``, or
         None for SAC with the same encoder (the paper's baseline). ``"auto"`` is AARL-Pixel if any observation is an image
-        and AARL-State otherwise, and None where neither can be trained: the encoder has no parameters that learn, or the
-        replay buffer has no windows (HerReplayBuffer is refused unless it is None)
+        and forward dynamics otherwise, and None where neither can be trained: the encoder has no parameters that learn, or
+        the replay buffer has no windows (HerReplayBuffer is refused unless it is None)
     :param aux_coef: Weight lambda of the auxiliary loss (equation 1). It matters with ``joint_optimizer=True``; by
         default the auxiliary loss has an Adam of its own, which divides a constant factor out again
     :param aux_batch_size: Windows for each auxiliary update, None for ``batch_size``
@@ -302,7 +303,7 @@ class SACAux(SAC):
         encoder = [parameter for parameter in self.critic.features_extractor.parameters() if parameter.requires_grad]
         if self.aux_loss == "auto":
             trainable = bool(encoder) and isinstance(self.replay_buffer, WindowReplayBuffer)
-            name = "aarl-pixel" if self.policy.image_keys else "aarl-state"
+            name = "aarl-pixel" if self.policy.image_keys else "forward-dynamics"
             self.aux_loss = catalog.load(name) if trainable else None
             if self.verbose >= 1:
                 print(f"Auxiliary loss: {name if trainable else 'none'}")

@@ -15,13 +15,17 @@ HYPERPARAMETERS: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [8], "features_extractor_class": "mlp", "features_extractor_kwargs": {"features_dim": 4}},
 }
 YAML = yaml.safe_dump({"default": HYPERPARAMETERS})
-# With the default encoder, and a checkpoint that is small.
+# With a checkpoint that is small.
 DENSE: dict[str, Any] = {
     "buffer_size": 1000,
     "learning_starts": 20,
     "batch_size": 16,
     "predictor_width": 8,
-    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8, "width": 8}},
+    "policy_kwargs": {
+        "net_arch": [8],
+        "features_extractor_class": "dense_mlp",
+        "features_extractor_kwargs": {"features_dim": 8, "width": 8},
+    },
     "device": "cpu",
 }
 SEARCH = """\
