@@ -131,7 +131,7 @@ def assert_same(first: Any, second: Any, where: str = "") -> None:
 def sac_and_ours(policy: str, env: Callable[[], Any], steps: int, ours: dict[str, Any], **settings: Any) -> tuple[SAC, SACAux]:
     """SB3's SAC and SACAux without an auxiliary loss, trained alike."""
     both: dict[str, Any] = {"buffer_size": 500, "learning_starts": 10, "batch_size": 16, "learning_rate": 1e-3, "tau": 0.02}
-    both |= {"seed": 5, "device": "cpu", **settings}
+    both |= {"seed": 5, "device": "cpu", "ent_coef": "auto", **settings}
     sac = SAC(policy, env(), **both).learn(steps)
     ours = {**both, **ours, "policy_kwargs": {**both["policy_kwargs"], **ours["policy_kwargs"]}}
     return sac, SACAux(policy, env(), **{"aux_loss": None, "policy_delay": 1, **ours}).learn(steps)
@@ -484,9 +484,8 @@ def test_schedules_and_aux_coef() -> None:
     assert model.ent_coef_optimizer.param_groups[0]["lr"] == pytest.approx(1e-2 * model._current_progress_remaining**2)
     assert model.ent_coef_optimizer.param_groups[0]["betas"] == (0.3, 0.99)
     assert model.critic.optimizer.param_groups[0]["lr"] == 1e-3
-    for delay in (1, 3):
-        model = make_model(learning_rate=lambda left: 1e-3 + left, policy_delay=delay).learn(10)
-        assert model.ent_coef_optimizer.param_groups[0]["lr"] == delay * model.actor.optimizer.param_groups[0]["lr"]
+    model = make_model(learning_rate=lambda left: 1e-3 + left).learn(10)
+    assert model.ent_coef_optimizer.param_groups[0]["lr"] == model.actor.optimizer.param_groups[0]["lr"] > 1e-3
 
     norms = []
     for coefficient in (0.0, 1.0, 3.0):

@@ -223,8 +223,8 @@ BODIES: dict[str, dict[str, Any]] = {
 
 
 def test_bodies_differ_from_the_defaults_in_nothing_else() -> None:
-    # They ran when the coefficient learnt at the rate of actor and critic, and AARL-State was the default loss.
-    changed = {"ent_coef_learning_rate": 3e-4, "aux_loss": "aarl-state"}
+    # They ran when SAC's coefficient and AARL-State were the defaults.
+    changed = {"ent_coef": "auto", "ent_coef_learning_rate": 3e-4, "aux_loss": "aarl-state"}
     defaults = load_hyperparameters(ZOO / "default.yml", "MyEnv-v0") | changed
     folders = [path.relative_to(ZOO).with_suffix("").as_posix() for path in ZOO.glob("*/*.yml")]
     assert {name for name in folders if name.startswith(("body/", "simba/"))} | {"forward_simba"} == BODIES.keys()
