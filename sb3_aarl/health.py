@@ -22,14 +22,7 @@ class ExplodedError(FloatingPointError):
 
 
 def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], place: str) -> None:
-    """
-    Raise an error unless all values are finite.
-
-    :param name: Name of the values in the error
-    :param values: Numbers of any type, or a dict of them
-    :param place: Where they are from, for the error
-    :raises NonFiniteError: when one is NaN or infinite
-    """
+    """Raise a NonFiniteError with name and place of the values unless all are finite; they may be of any type."""
     for key, array in values.items() if isinstance(values, dict) else [("", values)]:
         if np.issubdtype(np.asarray(array).dtype, np.floating) and not np.isfinite(array).all():
             index = np.argwhere(~np.isfinite(array))[0].tolist()
@@ -54,13 +47,8 @@ class QValueCheck:
         self, losses: Mapping[str, Mapping[int, float]], gamma: float, action_dim: int, describe: Callable[[int], str]
     ) -> None:
         """
-        Compare losses with what the sum of discounted rewards and entropies can be.
-
-        :param losses: Of some gradient steps, by name and number of the step
-        :param gamma: Discount factor
-        :param action_dim: Dimensions of an action
-        :param describe: From the number of a gradient step to its description in an error
-        :raises ExplodedError: when a Q value is ``EXPLODED`` times larger
+        Compare losses, by name and gradient step, with what the sum of discounted rewards and entropies can be; raise an
+        ExplodedError when a Q value is ``EXPLODED`` times larger.
         """
         errors = {step: loss**0.5 for step, loss in losses["critic_loss"].items()}
         values = {step: abs(loss) for step, loss in losses.get("actor_loss", {}).items()}  # minus the soft value of states
