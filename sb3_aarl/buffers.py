@@ -178,14 +178,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         crop_size: int | None = None,
     ) -> Any:
         """
-        Observations.
-
-        :param indices: Flat indices in (buffer_size, n_envs), not checked
-        :param following: Whether to return the next observation instead; (...) is what it and indices broadcast to
-        :param env: VecNormalize, which normalizes whole images: they are not cropped
-        :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
-        :return: (..., *observation shape) where they are stored, height and width those of the crop; a dict for Dict
-            observations
+        Observations (..., *shape) at flat indices in (buffer_size, n_envs), or the next ones where ``following`` is true;
+        (...) is what both broadcast to. With VecNormalize, which normalizes whole images, none is cropped.
         """
         positions = indices // self.n_envs
         # Positions before self.pos were written in this round of the ring, the others in the round before.

@@ -21,14 +21,7 @@ class FrameStore:
 
     Transition n (counted from the first one ever added) has its newest frame in row n, so the next observation's is in
     row n + 1. Where an episode ends, row n + 1 belongs to the next one, and the last frame of the old one is stored
-    separately.
-
-    :param key: Key of Dict observations, else ""; named in errors
-    :param buffer_size: Transitions per env that can be read back
-    :param n_envs: Number of envs
-    :param shape: Shape of a stacked observation; frames are stacked along its first axis, oldest first
-    :param dtype: Data type of observations
-    :param stack: Number of frames in an observation
+    separately. Frames are stacked along the first axis of an observation, oldest first.
     """
 
     def __init__(self, key: str, buffer_size: int, n_envs: int, shape: tuple[int, ...], dtype: Any, stack: int):
@@ -101,15 +94,12 @@ class FrameStore:
         self, indices: np.ndarray, newest: np.ndarray, age: np.ndarray, final: np.ndarray, crop_size: int | None = None
     ) -> th.Tensor:
         """
-        Stacked observations; ``age`` and ``final`` have the shape (...) of ``newest``, ``indices`` broadcasts to it.
+        Stacked observations (..., *shape), each cropped at a random position of its own if a crop's size is given.
 
-        :param indices: Flat indices of their transitions in (buffer_size, n_envs)
-        :param newest: Number of the transition whose row holds the newest frame
-        :param age: How many frames of the same episode came before the newest one
-        :param final: Whether the newest frame is stored separately
-        :param crop_size: Height and width in pixels that each observation is cropped to, at a random position of
-            its own; the frames of a stack stay together. None for no crop
-        :return: (..., *shape), height and width those of the crop
+        :param indices: Flat indices of their transitions in (buffer_size, n_envs); broadcasts to (...)
+        :param newest: (...), number of the transition whose row holds the newest frame
+        :param age: (...), how many frames of the same episode came before the newest one
+        :param final: (...), whether the newest frame is stored separately
         """
         back = np.arange(self.stack)[::-1]
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)

@@ -33,15 +33,10 @@ def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], place: s
 
 @dataclass
 class QValueCheck:
-    """
-    Stops a run that has diverged long before its losses are infinite.
+    """Stops a run that has diverged long before its losses are infinite."""
 
-    :param largest_reward: Largest absolute reward of all batches so far
-    :param first_error: Error of the untrained Q values; large where an encoder passes on large observations
-    """
-
-    largest_reward: float = 0.0
-    first_error: float = 0.0
+    largest_reward: float = 0.0  # absolute, of all batches so far
+    first_error: float = 0.0  # of the untrained Q values; large where an encoder passes on large observations
 
     def __call__(
         self, losses: Mapping[str, Mapping[int, float]], gamma: float, action_dim: int, describe: Callable[[int], str]

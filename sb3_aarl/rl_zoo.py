@@ -76,8 +76,6 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     and reach evaluations, ``enjoy`` and ``record_video`` too. Given ones win.
 
     Without a file ``sac_aux`` has AARL-State's for tasks of DeepMind Control, and RL-Zoo's own for SAC elsewhere.
-
-    :param arguments: RL-Zoo's arguments; the program ends with an error where the file cannot be read
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_aarl.rl_zoo train", add_help=False)
     parser.add_argument("--algo")

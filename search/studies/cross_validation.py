@@ -24,11 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
-    """
-    The best candidates of a search, the best first, in canonical form and each once.
-
-    :raises ValueError: when no candidate is complete
-    """
+    """The best candidates of a search, the best first, in canonical form and each once."""
     trials = ranked(study.get_trials(deepcopy=False), study.direction)
     losses = dict.fromkeys(loss.canonical() for loss in map(loss_of, trials) if loss is not None)
     if not losses:
@@ -39,10 +35,7 @@ def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
 def make_matrix(
     config: SearchConfig, study: optuna.Study, folder: Path, top: int | None = None, baselines: Sequence[Baseline] = ()
 ) -> Matrix:
-    """
-    The runs of a cross-validation: candidates and baselines x environments x seeds; ``top`` replaces the configuration's
-    number of candidates.
-    """
+    """Candidates and baselines x environments x seeds; ``top`` replaces the configuration's number of candidates."""
     section = _section(config)
     if config.environment in section.environments and (own := sorted({*config.seeds} & {*section.seeds})):
         logger.warning(
