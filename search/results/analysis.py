@@ -222,7 +222,7 @@ def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = St
     """The best trial and all its ancestors, the latest first; ``gain`` is the score less that of the best parent."""
     best = ranked(trials, direction)[:1]
     line = [*best, *(ancestor for trial in best for ancestor in lineage(trial, trials))]
-    table = trial_table(sorted(line, key=lambda trial: -trial.number)).set_index("number")
+    table = trial_table(line).set_index("number")
     best_of = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
     parents = [best_of(table["score"].reindex(numbers)) if numbers else np.nan for numbers in table["parents"]]
     table["gain"] = table["score"] - np.array(parents, dtype=float)

@@ -69,7 +69,7 @@ def write_report(
         evolution=_picture(evolution_plot({title: table}, {title: baselines}, study.direction)) if best else None,
         best=_candidates(best[:N_BEST]),
         winner=_candidates(best[:1]).to_dict("records"),
-        lineage=_candidates(sorted(lineage(best[0], trials), key=lambda trial: -trial.number)) if best else None,
+        lineage=_candidates(lineage(best[0], trials)) if best else None,
         validation=_validation(validation),
         taught=_taught(study, table),
         machines=analysis.readable("machines", machines),
