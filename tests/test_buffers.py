@@ -377,13 +377,6 @@ def test_what_was_before_a_reset_is_gone_even_inside_of_an_episode():
         check_windows(buffer, [steps[8:]], horizon)
 
 
-def test_many_short_episodes():
-    buffer = make_buffer(200, 2, stack=2)
-    histories = filled(buffer, 180, [(1, "terminated"), (2, "truncated"), (1, "by hand")], stack=2, padding="zeros")
-    for horizon in (1, 2):
-        check_windows(buffer, histories, horizon)
-
-
 def through_pickle(buffer: WindowReplayBuffer) -> WindowReplayBuffer:
     return pickle.loads(pickle.dumps(buffer))
 

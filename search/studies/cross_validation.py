@@ -73,10 +73,8 @@ def _make_runs(config: SearchConfig, variants: Sequence[Baseline]) -> dict[Cell,
 
 def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     """
-    The candidates by their mean AULC over all environments (paper, A.4), the best first.
-
-    :return: One row a candidate: mean score on each environment, then ``mean``, ``std`` (sample deviation
-        over seeds of the mean over environments), and ``runs``
+    The candidates by their mean AULC over all environments (paper, A.4), the best first; ``std`` is the sample deviation over
+    seeds of the mean over environments.
     """
     by_environment = runs.pivot_table(index="variant", columns="environment", values="score", aggfunc="mean")
     by_seed = runs.groupby(["variant", "seed"])["score"].mean().groupby("variant")
