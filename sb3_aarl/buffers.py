@@ -204,14 +204,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """
-        Add one transition of every env.
+        Add one transition of every env, not normalized, with the arguments of SB3's buffer.
 
-        :param obs: Observations (n_envs, ...), not normalized
-        :param next_obs: The following observations, of the old episode where it is done
-        :param action: (n_envs, action_dim), scaled to [-1, 1]
-        :param reward: (n_envs,)
-        :param done: (n_envs,), whether the episode ended, for whatever reason
-        :param infos: One dict per env; ``TimeLimit.truncated`` tells truncation from termination
         :raises ValueError: when a stack is not made of the frames before it; nothing is added then
         """
         current, following = self._by_key(obs), self._by_key(next_obs)

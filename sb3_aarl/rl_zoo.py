@@ -48,8 +48,6 @@ def register() -> None:
 
     Their ``env_kwargs`` are then those of ``make_dmc_env``, as for ``aarl``; ``gymnasium.make`` stays what it is. Other
     environments are made as RL-Zoo makes them; the key ``env_wrapper`` can name ``sb3_aarl.envs.wrap_env`` for them.
-
-    :raises ModuleNotFoundError: without RL-Zoo
     """
     from rl_zoo3 import ALGOS  # type: ignore[import-not-found]
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER  # type: ignore[import-not-found]
