@@ -68,11 +68,8 @@ def center_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
 
 def image_spaces(space: spaces.Space, normalized_image: bool = False) -> dict[str, spaces.Box]:
     """
-    The images among observations.
-
-    :param space: Observation space, images channel first
-    :param normalized_image: Whether images need not be bytes (SB3's ``normalize_images=False``)
-    :return: Key to image space; the key is empty where observations are not a Dict
+    The images among observations by key, which is empty where observations are not a Dict. ``normalized_image``: whether they
+    need not be bytes (SB3's ``normalize_images=False``).
     """
     parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
     boxes = {key: part for key, part in parts.items() if isinstance(part, spaces.Box)}
@@ -80,13 +77,7 @@ def image_spaces(space: spaces.Space, normalized_image: bool = False) -> dict[st
 
 
 def cropped_space(space: spaces.Space, size: int, normalized_image: bool) -> spaces.Space:
-    """
-    The observation space after images were cropped.
-
-    :param space: Observation space, images channel first
-    :param size: Height and width in pixels of cropped images
-    :param normalized_image: As in :func:`image_spaces`
-    """
+    """The observation space after images were cropped to ``size`` x ``size``."""
     images = image_spaces(space, normalized_image)
     cropped = {
         key: spaces.Box(box.low[:, :size, :size], box.high[:, :size, :size], dtype=box.dtype)  # type: ignore[arg-type]
@@ -98,16 +89,7 @@ def cropped_space(space: spaces.Space, size: int, normalized_image: bool) -> spa
 
 
 def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int | None, normalized_image: bool) -> str:
-    """
-    What ``augmentation`` means for these observations.
-
-    :param augmentation: One of ``AUGMENTATIONS``
-    :param space: Observation space, images channel first
-    :param crop_size: Height and width in pixels of cropped images, None for 84 if images are larger
-    :param normalized_image: As in :func:`image_spaces`
-    :return: ``random_crop``, ``random_shift`` or ``none``
-    :raises ValueError: for an unknown name, and for images that are smaller than the crop
-    """
+    """What ``augmentation`` means for these observations: ``random_crop``, ``random_shift`` or ``none``."""
     if augmentation not in AUGMENTATIONS:
         raise ValueError(f"unknown augmentation {augmentation!r}, expected one of {', '.join(AUGMENTATIONS)}")
     sizes = {key: box.shape[1:] for key, box in image_spaces(space, normalized_image).items()}

@@ -99,6 +99,10 @@ class WindowReplayBuffer(NStepReplayBuffer):
         the first frame may be repeated (Gymnasium's FrameStackObservation) or zeros may fill up (SB3's VecFrameStack)
     """
 
+    # Height and width in pixels that images are cropped to at random while their frames are gathered, each observation at a
+    # position of its own, also one that a window has twice; None for no crop, as always for n-step returns.
+    crop_size: int | None = None
+
     def __init__(
         self,
         buffer_size: int,
@@ -174,14 +178,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         crop_size: int | None = None,
     ) -> Any:
         """
-        Observations.
-
-        :param indices: Flat indices in (buffer_size, n_envs), not checked
-        :param following: Whether to return the next observation instead; (...) is what it and indices broadcast to
-        :param env: VecNormalize, which normalizes whole images: they are not cropped
-        :param crop_size: Height and width in pixels that images are cropped to at random, None for no crop
-        :return: (..., *observation shape) where they are stored, height and width those of the crop; a dict for Dict
-            observations
+        Observations (..., *shape) at flat indices in (buffer_size, n_envs), or the next ones where ``following`` is true;
+        (...) is what both broadcast to. With VecNormalize, which normalizes whole images, none is cropped.
         """
         positions = indices // self.n_envs
         # Positions before self.pos were written in this round of the ring, the others in the round before.
@@ -206,14 +204,8 @@ class WindowReplayBuffer(NStepReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """
-        Add one transition of every env.
+        Add one transition of every env, not normalized, with the arguments of SB3's buffer.
 
-        :param obs: Observations (n_envs, ...), not normalized
-        :param next_obs: The following observations, of the old episode where it is done
-        :param action: (n_envs, action_dim), scaled to [-1, 1]
-        :param reward: (n_envs,)
-        :param done: (n_envs,), whether the episode ended, for whatever reason
-        :param infos: One dict per env; ``TimeLimit.truncated`` tells truncation from termination
         :raises ValueError: when a stack is not made of the frames before it; nothing is added then
         """
         current, following = self._by_key(obs), self._by_key(next_obs)
@@ -301,29 +293,15 @@ class WindowReplayBuffer(NStepReplayBuffer):
         self._episode_over = np.array(state["episode_over"])
         self._truncate(~self._episode_over)
 
-    def sample(  # type: ignore[override]
-        self, batch_size: int, env: VecNormalize | None = None, crop_size: int | None = None
-    ) -> ReplayBufferSamples | DictReplayBufferSamples:
-        """
-        Transitions, uniform over all; the same as those of SB3's buffers for one seed.
-
-        :param batch_size: Number of transitions
-        :param env: VecNormalize that observations and rewards go through
-        :param crop_size: Height and width in pixels that images are cropped to at random while their frames are gathered,
-            each observation at a position of its own; None for no crop, as for n-step returns
-        """
-        positions = np.random.randint(0, self.size(), size=batch_size)
-        return self._get_samples(positions, env, **({} if crop_size is None else {"crop_size": crop_size}))
-
     def _get_samples(  # type: ignore[override]
-        self, batch_inds: np.ndarray, env: VecNormalize | None = None, crop_size: int | None = None
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
     ) -> ReplayBufferSamples | DictReplayBufferSamples:
         if self.n_steps > 1:
             # SB3's own code, which reads ``observations`` and ``next_observations``.
             return super()._get_samples(batch_inds, env)
         indices = batch_inds * self.n_envs + np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
         # Observations and next ones together.
-        both = self.gather(indices, np.array([[False], [True]]), env, crop_size)
+        both = self.gather(indices, np.array([[False], [True]]), env, self.crop_size)
         dones = self._take("dones", indices) * (1 - self._take("timeouts", indices))
         return (DictReplayBufferSamples if isinstance(both, dict) else ReplayBufferSamples)(
             map_parts(lambda part: part[0].to(self.device), both),
@@ -368,7 +346,6 @@ class WindowReplayBuffer(NStepReplayBuffer):
         horizon: int,
         env: VecNormalize | None = None,
         offsets: Sequence[int] | None = None,
-        crop_size: int | None = None,
     ) -> WindowSamples:
         """
         Windows of consecutive steps inside one episode of one env, uniform over all whole ones in the buffer.
@@ -378,7 +355,6 @@ class WindowReplayBuffer(NStepReplayBuffer):
         :param env: VecNormalize that observations and rewards go through
         :param offsets: Gather only the observations at these offsets from the start (0 to k), in this order; None for all
             k + 1
-        :param crop_size: As in ``sample``; an offset that is named twice gets two crops
         :raises NoWindowError: when no episode is long enough yet
         """
         if horizon < 1:
@@ -391,7 +367,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         # The last observation is the next one of the last step: the episode may have ended there.
         following = wanted == horizon
         # Gathered one offset after the other, so that all observations at some of the offsets are contiguous.
-        observations = self.gather(steps[:, wanted - following].T, following[:, None], env, crop_size)
+        observations = self.gather(steps[:, wanted - following].T, following[:, None], env, self.crop_size)
         return WindowSamples(
             map_parts(lambda part: part.transpose(0, 1).to(self.device), observations),
             self.to_torch(self._take("actions", steps), copy=False),

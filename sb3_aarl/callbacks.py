@@ -182,12 +182,7 @@ class LearningCurveCallback(BaseCallback):
 
 
 def replace_text(path: Path, text: str) -> None:
-    """
-    Write a file in one step: other processes may read it, or write it too, at any time.
-
-    :param path: The file; its folder is made if it is not there
-    :param text: Its contents, line ends as they are
-    """
+    """Write a file in one step, and make its folder: other processes may read it, or write it too, at any time."""
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
     try:

@@ -11,11 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_w
 
 
 def rows_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """
-    :param one: (n, ...)
-    :param other: Of a shape that broadcasts to that
-    :return: (n,), whether all values of a row are equal
-    """
+    """Whether all values of a row are equal, (n,), of two arrays that broadcast to (n, ...)."""
     return (one == other).reshape(len(one), -1).all(axis=1)
 
 
@@ -25,14 +21,7 @@ class FrameStore:
 
     Transition n (counted from the first one ever added) has its newest frame in row n, so the next observation's is in
     row n + 1. Where an episode ends, row n + 1 belongs to the next one, and the last frame of the old one is stored
-    separately.
-
-    :param key: Key of Dict observations, else ""; named in errors
-    :param buffer_size: Transitions per env that can be read back
-    :param n_envs: Number of envs
-    :param shape: Shape of a stacked observation; frames are stacked along its first axis, oldest first
-    :param dtype: Data type of observations
-    :param stack: Number of frames in an observation
+    separately. Frames are stacked along the first axis of an observation, oldest first.
     """
 
     def __init__(self, key: str, buffer_size: int, n_envs: int, shape: tuple[int, ...], dtype: Any, stack: int):
@@ -42,55 +31,27 @@ class FrameStore:
         self.buffer_size = buffer_size
         self.n_envs = n_envs
         self.shape = shape
-        self.dtype = np.dtype(dtype)
         self.stack = stack
         self.frame_shape = (shape[0] // stack, *shape[1:]) if stack > 1 else shape
         # Zeros of NumPy take memory as they are written to, those of PyTorch at once.
-        self.frames = th.from_numpy(np.zeros((buffer_size + stack, n_envs, *self.frame_shape), self.dtype))
-        self.final_frames: dict[int, th.Tensor] = {}  # by flat index in (buffer_size, n_envs)
+        self.frames = np.zeros((buffer_size + stack, n_envs, *self.frame_shape), dtype)
+        self.final_frames: dict[int, np.ndarray] = {}  # by flat index in (buffer_size, n_envs)
         self.zero_padded = np.zeros((buffer_size, n_envs), bool)  # whether zeros came before an episode's first frame
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Pickled tensors take several times their memory.
-        return {**self.__dict__, "frames": self.frames.numpy()}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self.frames = th.from_numpy(state["frames"])
-
     def split(self, observations: np.ndarray) -> np.ndarray:
-        """
-        :param observations: Stacked, (n, *shape)
-        :return: (n, stack, *frame_shape), oldest first
-        """
+        """The frames (n, stack, *frame_shape) of stacked observations (n, *shape), oldest first."""
         return observations.reshape(len(observations), self.stack, *self.frame_shape)
-
-    def begins(self, observations: np.ndarray) -> np.ndarray:
-        """
-        :param observations: Stacked, (n, *shape)
-        :return: (n,), which of them may begin an episode: their other frames repeat the newest one, or are zeros
-        """
-        frames = self.split(observations)
-        return rows_equal(frames[:, :-1], frames[:, -1:]) | rows_equal(frames[:, :-1], np.zeros_like(frames[:, -1:]))
 
     def check(
         self, observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, done: np.ndarray, number: int
     ) -> None:
-        """
-        Refuse stacks that are not made of the frames before them.
-
-        :param observations: (n_envs, *shape)
-        :param next_observations: (n_envs, *shape)
-        :param starts: (n_envs,), whether the observation begins an episode
-        :param done: (n_envs,), whether the episode is over
-        :param number: Number of the transition
-        :raises ValueError: naming the wrapper order
-        """
+        """Refuse stacks of transition ``number`` that are not made of the frames before them, naming the wrapper order."""
         if self.stack == 1:
             return
         old, new = self.split(observations), self.split(next_observations)
+        begins = rows_equal(old[:, :-1], old[:, -1:]) | rows_equal(old[:, :-1], np.zeros_like(old[:, -1:]))
         problems = {
-            "an episode begins neither with one frame repeated nor with zeros": starts & ~self.begins(observations),
+            "an episode begins neither with one frame repeated nor with zeros": starts & ~begins,
             # VecNormalize returns an episode's last observation with rounding errors.
             "the next observation is not the last one plus one new frame": ~done & ~rows_equal(new[:, :-1], old[:, 1:]),
         }
@@ -106,31 +67,21 @@ class FrameStore:
                 )
 
     def put(self, number: int, observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray) -> None:
-        """
-        :param number: Number of the transition, the next one
-        :param observations: (n_envs, *shape)
-        :param next_observations: (n_envs, *shape)
-        :param starts: (n_envs,), whether the observation begins an episode
-        """
+        """Store transition ``number``, the next one; ``starts`` (n_envs,): whether its observation begins an episode."""
         for env in range(self.n_envs):
             self.final_frames.pop(self._index(number, env), None)
         old, new = self.split(observations), self.split(next_observations)
         for row, frames in ((number, old), (number + 1, new)):
-            self.frames[row % len(self.frames)] = th.from_numpy(np.array(frames[:, -1], self.dtype))
+            self.frames[row % len(self.frames)] = frames[:, -1]
         position = number % self.buffer_size
         self.zero_padded[position] = self.zero_padded[position - 1]
         if starts.any():
             self.zero_padded[position, starts] = ~rows_equal(old[starts, :-1], old[starts, -1:])
 
     def put_final(self, number: int, envs: np.ndarray) -> None:
-        """
-        Store the last frames of episodes separately.
-
-        :param number: Number of the last transition
-        :param envs: (n_envs,), whether the episode is over
-        """
+        """Store the last frames of episodes that ended with transition ``number`` in ``envs`` (n_envs,) separately."""
         for env in np.flatnonzero(envs).tolist():
-            self.final_frames[self._index(number, env)] = self.frames[(number + 1) % len(self.frames), env].clone()
+            self.final_frames[self._index(number, env)] = self.frames[(number + 1) % len(self.frames), env].copy()
 
     def _index(self, number: int, env: int) -> int:
         return number % self.buffer_size * self.n_envs + env
@@ -139,21 +90,18 @@ class FrameStore:
         self, indices: np.ndarray, newest: np.ndarray, age: np.ndarray, final: np.ndarray, crop_size: int | None = None
     ) -> th.Tensor:
         """
-        Stacked observations; ``age`` and ``final`` have the shape (...) of ``newest``, ``indices`` broadcasts to it.
+        Stacked observations (..., *shape), each cropped at a random position of its own if a crop's size is given.
 
-        :param indices: Flat indices of their transitions in (buffer_size, n_envs)
-        :param newest: Number of the transition whose row holds the newest frame
-        :param age: How many frames of the same episode came before the newest one
-        :param final: Whether the newest frame is stored separately
-        :param crop_size: Height and width in pixels that each observation is cropped to, at a random position of
-            its own; the frames of a stack stay together. None for no crop
-        :return: (..., *shape), height and width those of the crop
+        :param indices: Flat indices of their transitions in (buffer_size, n_envs); broadcasts to (...)
+        :param newest: (...), number of the transition whose row holds the newest frame
+        :param age: (...), how many frames of the same episode came before the newest one
+        :param final: (...), whether the newest frame is stored separately
         """
         back = np.arange(self.stack)[::-1]
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
         numbers = th.from_numpy(rows * self.n_envs + (indices % self.n_envs)[..., None])
         if crop_size is None:
-            frames = self.frames.flatten(0, 1).index_select(0, numbers.flatten())
+            frames = th.from_numpy(self.frames).flatten(0, 1).index_select(0, numbers.flatten())
         else:
             top, left = (th.randint(length - crop_size + 1, newest.shape) for length in self.frame_shape[1:])
             frames = self._crops(numbers, top, left, crop_size)
@@ -161,7 +109,7 @@ class FrameStore:
         indices = np.broadcast_to(indices, newest.shape)
         # Few are at an episode's end or start.
         for index in map(tuple, np.argwhere(final).tolist()):
-            frame = self.final_frames[int(indices[index])]
+            frame = th.as_tensor(self.final_frames[int(indices[index])])
             if crop_size is not None:
                 frame = frame[:, top[index] : top[index] + crop_size, left[index] : left[index] + crop_size]
             stacked[(*index, -1)] = frame
@@ -174,43 +122,32 @@ class FrameStore:
 
     def _crops(self, numbers: th.Tensor, top: th.Tensor, left: th.Tensor, size: int) -> th.Tensor:
         """
-        Crops while frames are gathered, ten times as fast as afterwards.
-
-        :param numbers: Numbers of the frames as they are in memory, (..., stack)
-        :param top: First row of each crop, (...)
-        :param left: First column
-        :param size: Height and width
-        :return: (number of frames, channels, size, size)
+        Crops of the frames with these numbers (..., stack) in memory, (number of frames, channels, size, size), from these
+        first rows and columns (...): ten times as fast as a crop of gathered frames.
         """
         channels, height, width = self.frame_shape
         rows = ((numbers[..., None] * channels + th.arange(channels))[..., None] * height + th.arange(size)) * width
         starts = rows + (top * width + left)[..., None, None, None]
-        pixels = self.frames.flatten().unfold(0, size, 1)  # ``size`` pixels from every one on, nothing copied yet
+        # ``size`` pixels from every one on, nothing copied yet.
+        pixels = th.from_numpy(self.frames).flatten().unfold(0, size, 1)
         return pixels.index_select(0, starts.flatten()).view(-1, channels, size, size)
 
     def training_state(self, n_added: int) -> dict[str, th.Tensor]:
-        """
-        :param n_added: Number of transitions ever added
-        :return: What is stored, for ``load_training_state``; it shares memory with the store
-        """
-        # Through NumPy: torch.save writes all that a slice of a tensor is a part of.
-        frames = th.from_numpy(self.frames[: n_added + 1].numpy())
-        finals = list(self.final_frames.values()) or [th.empty(self.frame_shape, dtype=frames.dtype)]
+        """What ``n_added`` transitions have stored, for ``load_training_state``; it shares memory with the store."""
+        finals = np.array(list(self.final_frames.values()), self.frames.dtype).reshape(-1, *self.frame_shape)
         return {
-            "frames": frames,
+            "frames": th.from_numpy(self.frames[: n_added + 1]),
             "final_indices": th.tensor(list(self.final_frames), dtype=th.int64),
-            "final_frames": th.stack(finals)[: len(self.final_frames)],
+            "final_frames": th.from_numpy(finals),
             "zero_padded": th.from_numpy(self.zero_padded[:n_added]),
         }
 
     def load_training_state(self, state: dict[str, th.Tensor]) -> None:
-        """
-        :param state: Of a store of the same settings
-        """
-        self.frames[: len(state["frames"])] = state["frames"]
+        """Continue with what another store of the same settings has stored."""
+        self.frames[: len(state["frames"])] = state["frames"].numpy()
         self.zero_padded[: len(state["zero_padded"])] = state["zero_padded"].numpy()
-        pairs = zip(state["final_indices"].tolist(), state["final_frames"], strict=True)
-        self.final_frames = {index: frame.clone() for index, frame in pairs}
+        pairs = zip(state["final_indices"].tolist(), state["final_frames"].numpy(), strict=True)
+        self.final_frames = {index: frame.copy() for index, frame in pairs}
 
 
 def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:

@@ -22,14 +22,7 @@ class ExplodedError(FloatingPointError):
 
 
 def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], place: str) -> None:
-    """
-    Raise an error unless all values are finite.
-
-    :param name: Name of the values in the error
-    :param values: Numbers of any type, or a dict of them
-    :param place: Where they are from, for the error
-    :raises NonFiniteError: when one is NaN or infinite
-    """
+    """Raise a NonFiniteError with name and place of the values unless all are finite; they may be of any type."""
     for key, array in values.items() if isinstance(values, dict) else [("", values)]:
         if np.issubdtype(np.asarray(array).dtype, np.floating) and not np.isfinite(array).all():
             index = np.argwhere(~np.isfinite(array))[0].tolist()
@@ -40,27 +33,17 @@ def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], place: s
 
 @dataclass
 class QValueCheck:
-    """
-    Stops a run that has diverged long before its losses are infinite.
+    """Stops a run that has diverged long before its losses are infinite."""
 
-    :param largest_reward: Largest absolute reward of all batches so far
-    :param first_error: Error of the untrained Q values; large where an encoder passes on large observations
-    """
-
-    largest_reward: float = 0.0
-    first_error: float = 0.0
+    largest_reward: float = 0.0  # absolute, of all batches so far
+    first_error: float = 0.0  # of the untrained Q values; large where an encoder passes on large observations
 
     def __call__(
         self, losses: Mapping[str, Mapping[int, float]], gamma: float, action_dim: int, describe: Callable[[int], str]
     ) -> None:
         """
-        Compare losses with what the sum of discounted rewards and entropies can be.
-
-        :param losses: Of some gradient steps, by name and number of the step
-        :param gamma: Discount factor
-        :param action_dim: Dimensions of an action
-        :param describe: From the number of a gradient step to its description in an error
-        :raises ExplodedError: when a Q value is ``EXPLODED`` times larger
+        Compare losses, by name and gradient step, with what the sum of discounted rewards and entropies can be; raise an
+        ExplodedError when a Q value is ``EXPLODED`` times larger.
         """
         errors = {step: loss**0.5 for step, loss in losses["critic_loss"].items()}
         values = {step: abs(loss) for step, loss in losses.get("actor_loss", {}).items()}  # minus the soft value of states

@@ -44,11 +44,7 @@ class _CropsImages:
         return features_extractor(self.preprocess(obs))
 
     def preprocess(self, obs: PyTorchObs) -> PyTorchObs:
-        """
-        Crop images to their centre unless the augmentation did so at random; then as SB3 does.
-
-        :param obs: Observations (batch, ...), images as bytes
-        """
+        """Crop images to their centre unless the augmentation did so at random; then as SB3 does."""
         own = isinstance(self.features_extractor, (PixelEncoder, MultiInputEncoder))
         layout = th.channels_last if own else th.preserve_format
 
@@ -67,13 +63,7 @@ class _CropsImages:
 
 
 def map_images(obs: PyTorchObs, image_keys: Collection[str], function: Callable[[th.Tensor], th.Tensor]) -> PyTorchObs:
-    """
-    Apply a function to all images of an observation.
-
-    :param obs: Tensor or dict of tensors (batch, ...)
-    :param image_keys: Keys of the images; ``""`` for an observation that is no Dict
-    :param function: From (batch, channels, height, width) to the same
-    """
+    """Apply a function to all images of an observation; their key is ``""`` where it is no Dict."""
     if isinstance(obs, dict):
         return {key: function(value) if key in image_keys else value for key, value in obs.items()}
     return function(obs) if image_keys else obs
@@ -85,21 +75,12 @@ def has_parts(features_extractor: BaseFeaturesExtractor) -> TypeGuard[Encoder]:
 
 
 def read_trunk(features_extractor: BaseFeaturesExtractor, obs: Any) -> th.Tensor:
-    """
-    Output of the part of a shared encoder that actor and critic both read: all but its projection, if it has one.
-
-    :param features_extractor: The encoder
-    :param obs: Preprocessed observations (batch, ...)
-    """
+    """What actor and critic both read of a shared encoder: all but its projection, if it has one."""
     return features_extractor.trunk(obs) if has_parts(features_extractor) else features_extractor(obs)
 
 
 class Trunk(NamedTuple):
-    """
-    Stands for observations whose encoding is known up to the projection: computed once for actor and critic.
-
-    :param values: Output of the trunk of the critic's encoder, (batch, trunk_dim)
-    """
+    """Stands for observations of which the output of the encoder's trunk is known, computed once for actor and critic."""
 
     values: th.Tensor
 
@@ -337,12 +318,7 @@ class SACAuxPolicy(SACPolicy):
         self.critic.optimizer = self.make_optimizer(list(self.critic.parameters()), lr_schedule)
 
     def make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
-        """
-        An optimizer of the policy's class and arguments.
-
-        :param parameters: What it trains
-        :param lr_schedule: Its learning rate schedule
-        """
+        """An optimizer of the policy's class and arguments."""
         kwargs = dict(self.optimizer_kwargs)
         learns = any(parameter.requires_grad for parameter in self.critic.features_extractor.parameters())
         if learns and self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and not {"foreach", "fused"} & set(kwargs):

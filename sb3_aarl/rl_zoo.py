@@ -48,8 +48,6 @@ def register() -> None:
 
     Their ``env_kwargs`` are then those of ``make_dmc_env``, as for ``aarl``; ``gymnasium.make`` stays what it is. Other
     environments are made as RL-Zoo makes them; the key ``env_wrapper`` can name ``sb3_aarl.envs.wrap_env`` for them.
-
-    :raises ModuleNotFoundError: without RL-Zoo
     """
     from rl_zoo3 import ALGOS  # type: ignore[import-not-found]
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER  # type: ignore[import-not-found]
@@ -76,8 +74,6 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     and reach evaluations, ``enjoy`` and ``record_video`` too. Given ones win.
 
     Without a file ``sac_aux`` has AARL-State's for tasks of DeepMind Control, and RL-Zoo's own for SAC elsewhere.
-
-    :param arguments: RL-Zoo's arguments; the program ends with an error where the file cannot be read
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_aarl.rl_zoo train", add_help=False)
     parser.add_argument("--algo")

@@ -3,7 +3,6 @@
 import copy
 import logging
 import math
-import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -328,9 +327,8 @@ class SACAux(SAC):
         try:
             th.compile(th.square)(th.ones(1, device=self.device))
         except RuntimeError as error:
-            logger.warning(
-                "compile=True: torch.compile does not work here, nothing is compiled: %s", str(error).partition("\n")[0]
-            )
+            problem = str(error).partition("\n")[0]
+            logger.warning("compile=True: torch.compile does not work here, nothing is compiled: %s", problem)
             return
         # The actor loss stays as it is: compiled, its backward pass computes gradients of the critics too.
         for name in COMPILED:
@@ -354,7 +352,6 @@ class SACAux(SAC):
         self._update_learning_rates()
         # Networks compute in bfloat16 if asked to; their outputs, and all that is computed from them, are float32.
         autocast = th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bf16")
-        started = time.perf_counter()
         with self._logged() as log:
             for _ in range(gradient_steps):
                 self._n_updates += 1
@@ -417,8 +414,6 @@ class SACAux(SAC):
                     self._update_target()
                 # Running statistics of the encoder are copied, see SB3's issue 996.
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-                if self.compile and self._n_updates == 1:
-                    logger.info("compile=True: the first gradient step took %.0f s", time.perf_counter() - started)
 
     def _act(self, observations: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
         """Actions of the actor and their log probabilities, (batch, action_dim) and (batch, 1)."""
@@ -454,26 +449,20 @@ class SACAux(SAC):
         return self.aux_head(windows, self.critic.encode, self.critic_target.encode)
 
     def _sample(self, batch_size: int) -> tuple[ReplayBufferSamples, WindowSamples | None]:
-        """
-        Data of one gradient step, images augmented.
-
-        :param batch_size: Number of transitions, and of windows unless ``aux_batch_size`` is given
-        :return: Transitions, and the windows of the auxiliary loss: None without a loss, and as long as no episode is as
-            long as its horizon
-        """
+        """Transitions and windows of one gradient step, images augmented; no windows as long as no episode has one."""
         assert self.replay_buffer is not None
-        kwargs: dict[str, Any] = {"env": self._vec_normalize_env}
-        if self.policy.crops and type(self.replay_buffer) is WindowReplayBuffer:
-            kwargs["crop_size"] = self.policy.crop_size  # less to copy: augment() finds nothing left to crop
+        if type(self.replay_buffer) is WindowReplayBuffer:  # less to copy: augment() finds nothing left to crop
+            self.replay_buffer.crop_size = self.policy.crop_size if self.policy.crops else None
         augment: Callable[[Any], Any] = self.policy.augment
-        batch = self.replay_buffer.sample(batch_size, **kwargs)
+        env, n_windows = self._vec_normalize_env, self.aux_batch_size or batch_size
+        batch = self.replay_buffer.sample(batch_size, env)
         batch = batch._replace(observations=augment(batch.observations), next_observations=augment(batch.next_observations))
         if self.aux_head is None:
             return batch, None
         assert isinstance(self.replay_buffer, WindowReplayBuffer), "an auxiliary loss needs a WindowReplayBuffer"
         horizon, offsets = self.aux_head.loss.horizon, self.aux_head.offsets
         try:
-            windows = self.replay_buffer.sample_windows(self.aux_batch_size or batch_size, horizon, offsets=offsets, **kwargs)
+            windows = self.replay_buffer.sample_windows(n_windows, horizon, env, offsets)
         except NoWindowError:
             self._n_aux_skipped += 1
             return batch, None
@@ -556,9 +545,8 @@ class SACAux(SAC):
         progress_bar: bool = False,
     ) -> SelfSACAux:
         if not reset_num_timesteps and self._stored_timesteps != self.num_timesteps:
-            self._last_obs = (
-                None  # a callback ended learn() before the last transition was stored: SB3 resets the environments
-            )
+            # A callback ended learn() before the last transition was stored: SB3 resets the environments.
+            self._last_obs = None
         try:
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         except ValueError as error:

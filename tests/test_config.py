@@ -17,7 +17,6 @@ from search.training.config import (
     ConfigError,
     check_hyperparameters,
     load_hyperparameters,
-    merge,
     read_yaml,
     resolve_env_id,
 )
@@ -270,28 +269,6 @@ def test_values_have_the_types_of_the_arguments(tmp_path: Path, text: str, value
     assert key == text.partition(":")[0]
     assert read == value and type(read) is type(value)
     assert check_hyperparameters({key: read}, "Pendulum-v1", "again") == {key: read}
-
-
-mappings = st.recursive(
-    st.dictionaries(st.sampled_from("abc"), st.integers(0, 9), max_size=3),
-    lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
-)
-
-
-def leaves(values: Any, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
-    if not isinstance(values, dict):
-        return {path: values}
-    return {where: leaf for key in values for where, leaf in leaves(values[key], (*path, key)).items()}
-
-
-@given(mappings, mappings)
-def test_merging(one: dict[str, Any], other: dict[str, Any]) -> None:
-    merged = leaves(merge(one, other))
-    assert leaves(other).items() <= merged.items()
-    assert merged.keys() <= leaves(one).keys() | leaves(other).keys()
-    # Of the first one stays what the other does not touch.
-    untouched = {k: v for k, v in leaves(one).items() if not any(k[: len(o)] == o or o[: len(k)] == k for o in leaves(other))}
-    assert all(merged[k] == v for k, v in untouched.items() if k in merged)
 
 
 def test_short_names_of_environments() -> None:

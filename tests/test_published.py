@@ -2,7 +2,6 @@
 
 import copy
 import math
-from collections import Counter
 
 import gymnasium as gym
 import pytest
@@ -52,10 +51,6 @@ def make_model(observation: str, env: gym.Env, loss: object) -> SACAux:
         seed=0,
         device="cpu",
     )
-
-
-def test_as_many_as_printed() -> None:
-    assert Counter(candidate.table for candidate in PUBLISHED) == {9: 35, 12: 35, 13: 29, 14: 25}
 
 
 @pytest.mark.slow

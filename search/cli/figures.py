@@ -1,107 +1,78 @@
-"""The commands ``aarl figures``: the paper's figures from stored data, each as one file."""
+"""The command ``aarl figures``: the paper's figures from stored data, each as one file."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from search.cli import options
 from search.cli.console import say
-from search.cli.options import SearchFolders, Storage, open_studies
+from search.cli.options import Storage, open_studies
 from search.cli.results import say_missing
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
-    from optuna import Study
 
-app = typer.Typer(no_args_is_help=True, help="Draw the paper's figures from stored data, each as one file.")
-Out = Annotated[
-    Path | None,
-    typer.Option(help="File that ends in .png, .pdf or .svg. Default: a .png of the figure's name in the (first) folder."),
-]
-Studies = dict[str, "tuple[Study, Path]"]
+app = typer.Typer()
+BENCHMARK = Path("runs/benchmark")
 
 
-@app.command()
-def evolution(folders: SearchFolders = None, storage: Storage = None, out: Out = None) -> None:
-    """Scores of all candidates by generation, with the baselines that are trained (figures 4 and 6)."""
-    from search.results.plots import evolution_plot
-    from search.results.report import stored_baselines
-
-    studies = open_studies(folders, storage)
-    direction, *_ = (found.direction for found, _ in studies.values())
-    lines = {name: stored_baselines(folder) for name, (_, folder) in studies.items()}
-    write_figure(evolution_plot(candidates(studies), lines, direction), out, "evolution", studies)
-
-
-@app.command()
-def histogram(
-    folders: SearchFolders = None,
+@app.command(rich_help_panel="Many agents")
+def figures(
+    kind: Annotated[
+        Literal["evolution", "histogram", "curves", "rankings", "patterns"],
+        typer.Argument(
+            help="Scores by generation, beside the baselines (the paper's figures 4 and 6); their distribution in up to three "
+            "searches (7); learning curves of a benchmark (9), or of the best candidates under three metrics (10); scores "
+            "with and without each pattern of table 5 (11).",
+        ),
+    ],
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Folders of searches, or their configuration files; for curves that of a benchmark. Default: the only search "
+            f"in runs/, or {BENCHMARK}."
+        ),
+    ] = None,
     storage: Storage = None,
-    out: Out = None,
+    pattern: options.Patterns = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File that ends in .png, .pdf or .svg. Default: a .png of the figure's name in the (first) folder."),
+    ] = None,
 ) -> None:
-    """Distribution of the scores of up to three searches, such as with and without pruning of the space (figure 7)."""
-    from search.results.plots import histogram_plot
-
-    studies = open_studies(folders, storage)
-    write_figure(histogram_plot(candidates(studies)), out, "histogram", studies)
-
-
-@app.command()
-def curves(
-    folder: options.Benchmark = Path("runs/benchmark"),
-    out: Out = None,
-) -> None:
-    """Learning curves of a benchmark with their deviation over seeds (figure 9)."""
-    from search.results.plots import learning_curves_plot
+    """Draw a figure of the paper from stored data, as one file."""
+    from search.results import analysis, plots
+    from search.results.report import stored_baselines
     from search.results.table import read_runs
     from search.studies.benchmark import read_curves
 
-    write_figure(learning_curves_plot(read_curves(folder)), out or folder / "curves.png")
-    say_missing(read_runs(folder))
-
-
-@app.command()
-def rankings(
-    folder: options.SearchFolder = None,
-    storage: Storage = None,
-    out: Out = None,
-) -> None:
-    """Learning curves of the best candidates under three metrics (figure 10)."""
-    from search.results.plots import rankings_plot
-
-    studies = open_studies([folder], storage)
-    (table,) = candidates(studies).values()
-    write_figure(rankings_plot(table), out, "rankings", studies)
-
-
-@app.command()
-def patterns(
-    folders: SearchFolders = None,
-    storage: Storage = None,
-    pattern: options.Patterns = None,
-    out: Out = None,
-) -> None:
-    """Scores with and without each pattern of table 5 (figure 11)."""
-    from search.results.analysis import PATTERNS
-    from search.results.plots import patterns_plot
-
+    if pattern and kind != "patterns":
+        raise ValueError("--pattern is for aarl figures patterns")
+    if kind in ("curves", "rankings") and len(folders or ()) > 1:
+        raise ValueError(f"aarl figures {kind} takes one folder")
+    if kind == "curves":
+        folder = folders[0] if folders else BENCHMARK
+        write_figure(plots.learning_curves_plot(read_curves(folder)), out or folder / "curves.png")
+        say_missing(read_runs(folder))
+        return
     studies = open_studies(folders, storage)
-    named = {**PATTERNS, **{text: text for text in pattern or ()}}
-    write_figure(patterns_plot(candidates(studies), named), out, "patterns", studies)
+    tables = {name: analysis.trial_table(study.get_trials(deepcopy=False)) for name, (study, _) in studies.items()}
+    first, folder = next(iter(studies.values()))
+    if kind == "evolution":
+        lines = {name: stored_baselines(path) for name, (_, path) in studies.items()}
+        figure = plots.evolution_plot(tables, lines, first.direction)
+    elif kind == "histogram":
+        figure = plots.histogram_plot(tables)
+    elif kind == "rankings":
+        figure = plots.rankings_plot(next(iter(tables.values())))
+    else:
+        figure = plots.patterns_plot(tables, {**analysis.PATTERNS, **{text: text for text in pattern or ()}})
+    write_figure(figure, out or folder / f"{kind}.png")
 
 
-def candidates(studies: Studies) -> "dict[str, pd.DataFrame]":
-    """The candidates of studies, as figures take them."""
-    from search.results.analysis import trial_table
-
-    return {name: trial_table(study.get_trials(deepcopy=False)) for name, (study, _) in studies.items()}
-
-
-def write_figure(figure: "Figure", out: Path | None, name: str = "", studies: Studies | None = None) -> None:
-    """Write a figure to a file, or under its name into the folder of the first study."""
-    path = out or next(folder for _, folder in (studies or {}).values()) / f"{name}.png"
+def write_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure to a file, whose folder is made if it is not there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     say(f"Figure: {path}")

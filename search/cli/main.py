@@ -62,9 +62,8 @@ def explain(error: Exception) -> str | None:
 
 
 app = typer.Typer(cls=Program, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-for group in (train, search, matrices, results):
+for group in (train, search, matrices, results, figures):
     app.add_typer(group.app)
-app.add_typer(figures.app, name="figures", rich_help_panel="Many agents")
 
 
 def show_version(wanted: bool) -> None:

@@ -82,7 +82,7 @@ def search(
         running = RayExecutor(ray_address, 1 if cpus_per_run is None else cpus_per_run, gpus_per_run or 0)
     else:
         running = LocalExecutor(at_once)
-    annotate = annotations(study, settings, path)
+    annotate = annotations(study, path)
     progresses: Any = iter(
         Driver(study, opened, runs_of(settings), running, path, at_once, settings.retries, on_change=annotate)
     )
@@ -110,19 +110,17 @@ def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
     return kinds
 
 
-def annotations(study: "Study", config: "SearchConfig", folder: Path) -> "Callable[[Trial], None]":
+def annotations(study: "Study", folder: Path) -> "Callable[[Trial], None]":
     """Write the note of a study; the function that is returned keeps the notes of its trials and its plot up to date."""
     from search.results.dashboard import annotate_study, annotate_trial, update_plots
     from search.results.report import stored_baselines
-    from search.studies.search import settings
-    from search.training.provenance import provenance
 
-    annotate_study(study, settings(config), provenance())
+    annotate_study(study)
     drawn = -PLOT_SECONDS
 
     def annotate(trial: "Trial") -> None:
         nonlocal drawn
-        annotate_trial(study, trial)
+        annotate_trial(trial)
         if time.monotonic() - drawn > PLOT_SECONDS:
             drawn = time.monotonic()
             update_plots(study, stored_baselines(folder))

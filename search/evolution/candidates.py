@@ -119,7 +119,7 @@ class Candidates:
             return Candidate(self.sampler.initial[slot], operation)
         # What replaces a failed random loss must not depend on whether the model knows another generation by then.
         is_early = attempt > 0 and operation == "random"
-        if self.sampler.screening == 1 or not self.model.n_trials or is_early:
+        if self.sampler.screening == 1 or not self.model.losses or is_early:
             return self._draw_new(rng, operation, slot, is_known)
         offspring = [self._draw_new(rng, operation, slot, is_known) for _ in range(self.sampler.screening)]
         return offspring[self.model.best([candidate.loss for candidate in offspring], self.model.draw(rng))]

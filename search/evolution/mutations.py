@@ -1,4 +1,7 @@
-"""The paper's mutations of an auxiliary loss (section 2.2, figure 3, A.3), as pure functions."""
+"""
+The paper's mutations of an auxiliary loss (section 2.2, figure 3, A.3), as pure functions: a ValueError where the offspring is
+not valid, and is to be redrawn.
+"""
 
 from collections.abc import Sequence
 
@@ -12,8 +15,6 @@ def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str
     """
     Flip each bit of both masks with probability 1 / (2 (3k + 1)), k being the horizon, independently. Where operators are
     searched too (the paper does not say how), the operator is redrawn and negatives are switched with the same probability.
-
-    :raises ValueError: when the offspring is not valid (paper, A.3: it is redrawn)
     """
     flip_rate = 1 / (2 * (3 * loss.horizon + 1))
     flips = rng.random((2, 3 * loss.horizon + 1)) < flip_rate
@@ -26,11 +27,7 @@ def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str
 
 
 def crossover(loss: AuxLoss, other: AuxLoss, rng: np.random.Generator) -> AuxLoss:
-    """
-    Take each bit of both masks, and the operator, from one of two parents of one horizon at random.
-
-    :raises ValueError: when the offspring is not valid
-    """
+    """Take each bit of both masks, and the operator, from one of two parents of one horizon at random."""
     from_other = rng.random((2, 3 * loss.horizon + 1)) < 0.5
     source, target = np.where(from_other, (other.source, other.target), (loss.source, loss.target)).tolist()
     operator = loss if rng.random() < 0.5 else other
@@ -41,8 +38,6 @@ def horizon_change(loss: AuxLoss, rng: np.random.Generator, max_horizon: int = M
     """
     Drop the last step (action, reward, state) of both masks, or append three random bits to each. Both ways are equally
     probable; at the ends of 1..max_horizon only one is left.
-
-    :raises ValueError: when the offspring is not valid, or the space has one horizon only
     """
     ways = [change for change in (-1, 1) if 1 <= loss.horizon + change <= max_horizon]
     if not ways:

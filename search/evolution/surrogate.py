@@ -29,57 +29,32 @@ def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
 
 
 class TokenModel:
-    """
-    scikit-learn's BayesianRidge on sums over all trials, so that a fit costs the same however many there were.
-
-    A Bayesian ridge regression depends on its data only through their number and their centred second moments. It is fitted to
-    a square root of these, as many rows as there are features; the missing rows come in through its prior, as ``alpha_1``
-    enters the noise precision exactly like half a row. Scores are standardised first, so that their unit does not matter.
-    """
+    """scikit-learn's BayesianRidge on all finished trials. Scores are standardised, so that their unit does not matter."""
 
     def __init__(self, max_horizon: int):
         self.max_horizon = max_horizon
-        self.n_trials = 0
+        self.losses: list[AuxLoss] = []
+        self.values: list[float] = []
         n_features = 6 * max_horizon + 2 + 6 + 1 + len(OPERATORS) + 1
-        # Of the features and the score, which comes last: means, and sums of products of deviations from them.
-        self.means = np.zeros(n_features + 1)
-        self.moments = np.zeros((n_features + 1, n_features + 1))
         # The posterior of the weights: its mean, and a square root of its covariance. Before there are data, nothing.
         self.mean = np.zeros(n_features)
         self.root = np.eye(n_features)
 
     def add(self, losses: Sequence[AuxLoss], values: Sequence[float]) -> None:
         """Add finished trials and fit again; values (higher is better) that are not finite, or too large, are skipped."""
-        finite = np.abs(values) < LARGEST
-        if not finite.any():
-            return
-        rows = np.column_stack([features(losses, self.max_horizon), values])[finite]
+        finite = [(loss, value) for loss, value in zip(losses, values, strict=True) if abs(value) < LARGEST]
+        self.losses += [loss for loss, _ in finite]
+        self.values += [value for _, value in finite]
+        scores = np.array(self.values)
+        if not finite or scores.std() <= 1e-12 * abs(scores.mean()):
+            return  # no scores, or all alike: nothing to learn
         with BLAS.limit(limits=1, user_api="blas"):
-            shift = rows.mean(axis=0) - self.means
+            rows = features(self.losses, self.max_horizon)
+            ridge = BayesianRidge().fit(rows, (scores - scores.mean()) / scores.std())
             deviations = rows - rows.mean(axis=0)
-            weight = len(rows) / (self.n_trials + len(rows))
-            self.moments += deviations.T @ deviations + self.n_trials * weight * np.outer(shift, shift)
-            self.means += weight * shift
-            self.n_trials += len(rows)
-            self._fit()
-
-    def _fit(self) -> None:
-        deviation = np.sqrt(self.moments[-1, -1] / self.n_trials)
-        if deviation <= 1e-12 * abs(self.means[-1]):
-            return  # all scores alike: nothing to learn
-        unit = np.ones(len(self.means))
-        unit[-1] = deviation
-        moments = self.moments / np.outer(unit, unit)
-        eigenvalues, vectors = np.linalg.eigh(moments)
-        kept = eigenvalues > 1e-12 * eigenvalues[-1]
-        rows = np.sqrt(eigenvalues[kept])[:, None] * vectors[:, kept].T
-        ridge = BayesianRidge(
-            alpha_1=1e-6 + (self.n_trials - len(rows)) / 2, alpha_init=1.0, lambda_init=1.0, fit_intercept=False
-        )
-        ridge.fit(rows[:, :-1], rows[:, -1])
-        precision = ridge.alpha_ * moments[:-1, :-1] + ridge.lambda_ * np.eye(len(unit) - 1)
-        self.mean = ridge.coef_
-        self.root = np.linalg.inv(np.linalg.cholesky(precision)).T
+            precision = ridge.alpha_ * deviations.T @ deviations + ridge.lambda_ * np.eye(rows.shape[1])
+            self.mean = ridge.coef_
+            self.root = np.linalg.inv(np.linalg.cholesky(precision)).T
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
         """One draw of the weights from the posterior."""

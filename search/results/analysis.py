@@ -44,13 +44,8 @@ COLUMNS: dict[str, Any] = {
 
 def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
-    The trials of a study as the table that the other functions take, one row each, finished or not.
-
-    :param trials: Trials of a study
-    :return: ``number``; ``state`` (``complete``, ``pruned``, ``fail``, ``interrupted``, ``running``, ``waiting``);
-        ``generation``; ``operation``; ``parents`` (numbers); ``score`` (NaN where there is none); ``loss`` (as it was
-        searched) and ``canonical``, both an AuxLoss or None; ``horizon`` (agent steps), ``operator``, ``negatives`` of the
-        loss; ``curve``, a list of (environment steps, mean return, standard deviation)
+    The trials of a study as the table that the other functions take, one row each, finished or not: ``score`` is NaN where
+    there is none, ``loss`` and ``canonical`` an AuxLoss or None, ``curve`` a list of (environment steps, mean, deviation).
     """
     rows = []
     for trial in trials:
@@ -110,9 +105,6 @@ def table5_classes(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = 
 
     Section 3.3 compares losses with n_target > n_source to "the other way around", which it writes n_target < n_source. So
     a loss with n_target = n_source is in neither class.
-
-    :return: One row an analysed trial, one column a pattern, then ``COUNTS``
-    :raises ValueError: for a pattern that cannot be read
     """
     losses = analysed(table)["loss"]
     parsed = {name: catalog.resolve(pattern) for name, pattern in patterns.items()}
@@ -132,10 +124,6 @@ def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS
     All analysed trials of all generations are one sample, as in the paper. They are not independent: candidates descend from
     each other, and later generations score higher and have other patterns. So p-values are lower than those of an
     experiment, and they are not corrected for the number of tests.
-
-    :return: One row a pattern, then ``COUNTS``: ``difference`` of the mean scores (with - without), ``welch_p`` of Welch's
-        two-sided t-test (NaN where a class is too small), ``mean_with``, ``mean_without``, ``n_with``, ``n_without``,
-        ``n_neither``
     """
     scores = analysed(table)["score"]
     classes = table5_classes(table, patterns)
@@ -178,9 +166,6 @@ def effects(table: pd.DataFrame, by: str | Sequence[str]) -> pd.DataFrame:
     """
     Scores of the analysed trials of each group, and their differences from all others: ``by="horizon"``,
     ``by=["operator", "negatives"]``, ``by="operation"`` (the effect of the mutations), ``by="generation"``.
-
-    :return: One row a group: ``n``, ``mean``, ``std``, ``median``, ``difference`` of its mean to that of all others, and
-        ``welch_p`` as in :func:`table5`
     """
     trials = analysed(table)
     groups = trials.groupby(by if isinstance(by, str) else list(by))["score"]
@@ -196,10 +181,6 @@ def importances(table: pd.DataFrame) -> pd.DataFrame:
 
     A loss has no parameters for tokens beyond its horizon: such a token is not chosen. The horizon and, if they vary,
     operator and negatives are parameters too: what they explain is not attributed to the tokens.
-
-    :return: One row a parameter (``source/s_t+1``, ``target/r_t``, ``horizon``, ...), the most important first:
-        ``importance`` (they sum to 1), and for tokens ``difference`` (mean score with - without), ``n_with``, ``n_without``
-    :raises ValueError: when there are no two different scores
     """
     trials = analysed(table)
     scores = trials["score"]
@@ -222,11 +203,9 @@ def importances(table: pd.DataFrame) -> pd.DataFrame:
 def diversity(table: pd.DataFrame) -> pd.DataFrame:
     """
     How different the losses of each generation are. Trials that are complete or pruned count: the slot of a failed one has
-    another candidate, and one that runs may still fail.
-
-    :return: One row a generation: ``n`` losses, ``distinct`` (share of different canonical forms, operators included), and
-        ``hamming``: mean over all pairs of the number of bits in which the masks of their canonical forms differ, shorter ones
-        filled up with zeros (NaN for fewer than two losses)
+    another candidate, and one that runs may still fail. ``distinct`` is the share of different canonical forms, operators
+    included, ``hamming`` the mean over all pairs of the number of bits in which the masks of their canonical forms differ,
+    shorter ones filled up with zeros.
     """
     trials = table[table["state"].isin(["complete", "pruned"]) & table["loss"].notna()]
     rows = {}
@@ -240,15 +219,10 @@ def diversity(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
-    """
-    The best trial and all its ancestors, the latest first; empty if no trial has a score.
-
-    :return: By ``number``: ``generation``, ``operation``, ``parents``, ``score``, ``gain`` (the score less that of the best
-        parent, NaN without parents) and the notation of the ``loss``
-    """
+    """The best trial and all its ancestors, the latest first; ``gain`` is the score less that of the best parent."""
     best = ranked(trials, direction)[:1]
     line = [*best, *(ancestor for trial in best for ancestor in lineage(trial, trials))]
-    table = trial_table(sorted(line, key=lambda trial: -trial.number)).set_index("number")
+    table = trial_table(line).set_index("number")
     best_of = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
     parents = [best_of(table["score"].reindex(numbers)) if numbers else np.nan for numbers in table["parents"]]
     table["gain"] = table["score"] - np.array(parents, dtype=float)
@@ -258,11 +232,8 @@ def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = St
 
 def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
-    Where the trials were trained, and how long it took.
-
-    :return: One row a device and commit, as noted by the driver: ``trials`` whose seconds it noted, failed ones included, but
-        not those that were interrupted; their ``hours``, one run after the other; ``core_hours`` (hours x threads; NaN for
-        GPUs and where nothing is noted)
+    Where the trials were trained, and how long it took, one run after the other; failed ones count, interrupted ones do not.
+    ``core_hours`` are hours x threads, NaN for GPUs.
     """
     rows = []
     for attributes in (trial.user_attrs for trial in trials if "seconds" in trial.user_attrs):

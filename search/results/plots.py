@@ -34,7 +34,6 @@ HISTOGRAMS: tuple[dict[str, Any], ...] = (
     {"facecolor": "none", "edgecolor": ORANGE, "linewidth": 1.4, "hatch": "...", "linestyle": "--"},
 )
 SCORE = "Score (AULC, mean return)"
-AXIS = {"showline": True, "linecolor": GREY, "gridcolor": "#e5e5e5", "zeroline": False, "ticks": "outside"}
 
 
 def evolution_figure(
@@ -77,20 +76,10 @@ def evolution_figure(
             line={"dash": DASHES[position % len(DASHES)], "color": COLOURS[2 + position % 3], "width": 1.5},
             hovertemplate=f"{escape(name)}: %{{y:.1f}}<extra></extra>",
         )
-    figure.update_layout(
-        template="none",
-        title={"text": "Evolution of auxiliary losses", "font": {"size": 16}, "x": 0.01, "xanchor": "left"},
-        font={"family": "system-ui, sans-serif", "size": 13, "color": "#222222"},
-        paper_bgcolor="white",
-        plot_bgcolor="white",
-        showlegend=True,
-        legend={"orientation": "h", "yanchor": "top", "y": -0.18, "x": 0},
-        margin={"l": 70, "r": 20, "t": 50, "b": 60},
-        hovermode="closest",
-    )
-    ticks = {"tickmode": "array", "tickvals": generations, "showgrid": False}
-    figure.update_xaxes(title={"text": "Generation"}, range=ends, **AXIS | ticks)
-    figure.update_yaxes(title={"text": SCORE, "standoff": 12}, automargin=True, **AXIS)
+    title = {"text": "Evolution of auxiliary losses"}
+    figure.update_layout(template="simple_white", title=title, legend={"orientation": "h", "yanchor": "top", "y": -0.18})
+    figure.update_xaxes(title={"text": "Generation"}, range=ends, tickvals=generations)
+    figure.update_yaxes(title={"text": SCORE})
     return figure
 
 

@@ -11,12 +11,8 @@ METRICS = ("aulc", "first", "last")
 
 def rankings(table: pd.DataFrame) -> pd.DataFrame:
     """
-    Trials under three metrics of their learning curves.
-
-    :param table: Trials that can be compared, as returned by ``analysis.analysed``
-    :return: One row a trial that has a curve, in the order of AULC: ``number``, ``loss``, ``curve``, ``aulc`` (mean return
-        over all checkpoints), ``first`` and ``last`` (mean return at the first and the last checkpoint), and the ranks by them
-    :raises ValueError: when no trial has a learning curve, or they have different checkpoints
+    The trials of ``analysis.analysed`` that have a curve, in the order of AULC, with their ranks by AULC and by their mean
+    returns at the first and the last checkpoint.
     """
     trials = table[table["curve"].map(len) > 0]
     if trials.empty:

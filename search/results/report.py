@@ -34,10 +34,7 @@ def stored_baselines(folder: Path) -> list[tuple[str, float]]:
 
 
 def generation_table(table: pd.DataFrame) -> pd.DataFrame:
-    """
-    What became of the trials of every generation: trials by state, ``average``, ``lowest`` and ``highest`` score (NaN
-    without any), ``distinct`` and ``hamming`` as in :func:`search.results.analysis.diversity`.
-    """
+    """What became of the trials of every generation."""
     # Other samplers than ours may propose what is no valid loss: it is pruned at once, and costs nothing.
     trials = table[(table["state"] != "pruned") | table["loss"].notna()]
     scores = trials.groupby("generation")["score"].agg(average="mean", lowest="min", highest="max")
@@ -72,7 +69,7 @@ def write_report(
         evolution=_picture(evolution_plot({title: table}, {title: baselines}, study.direction)) if best else None,
         best=_candidates(best[:N_BEST]),
         winner=_candidates(best[:1]).to_dict("records"),
-        lineage=_candidates(sorted(lineage(best[0], trials), key=lambda trial: -trial.number)) if best else None,
+        lineage=_candidates(lineage(best[0], trials)) if best else None,
         validation=_validation(validation),
         taught=_taught(study, table),
         machines=analysis.readable("machines", machines),

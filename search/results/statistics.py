@@ -27,10 +27,6 @@ def interquartile_means(runs: pd.DataFrame) -> pd.DataFrame:
     The IQM is over returns as they are, so only over tasks of one scale: those of DeepMind Control (0 to 1000) together,
     each other environment by itself. Only tasks count that all variants of the checkpoint have runs on, and of each variant
     the seeds that it has on all of them, so that every task weighs the same; variants without any run are left out.
-
-    :return: One row for each ``checkpoint``, ``tasks`` (name of the scale; of a single task its own) and ``variant``:
-        ``n_tasks``, ``planned``, ``runs`` that count, ``iqm`` (NaN without any), ``low`` and ``high`` (NaN where a task has
-        one run only), the runs ``left_out``, and names of the tasks ``skipped``
     """
     rows = []
     scales = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
@@ -57,8 +53,6 @@ def improvements(runs: pd.DataFrame) -> pd.DataFrame:
     """
     Probability that a run of one variant is better than one of another on the same task, a tie being half, as the mean over
     all tasks that both have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap.
-
-    :return: One row for each ``checkpoint``, ``variant`` and ``over``: ``n_tasks``, ``probability``, ``low`` and ``high``
     """
     rows = []
     for checkpoint, part in runs.dropna(subset="mean").groupby("checkpoint"):

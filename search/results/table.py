@@ -39,11 +39,7 @@ def _paper() -> dict[int, dict[str, Any]]:
 
 
 def paper_scores(number: int | None) -> pd.DataFrame:
-    """
-    A table of the paper, empty for None: one row a score with ``checkpoint`` (environment steps), ``environment`` (its id),
-    ``column`` (the paper's heading), ``variant`` (the name in ``zoo_configs``, None for methods that are not here), ``mean``,
-    ``std`` and ``runs``.
-    """
+    """A table of the paper, empty for None; ``variant`` is a name in ``zoo_configs``, None for methods that are not here."""
     rows = []
     for table in [] if number is None else [_paper()[number]]:
         for checkpoint, tasks in table["scores"].items():
@@ -65,12 +61,8 @@ def closest_table(variants: Iterable[str]) -> int | None:
 
 def read_runs(folder: Path) -> pd.DataFrame:
     """
-    The runs of a benchmark: one row for each checkpoint of each planned run with ``variant``, ``environment``, ``seed``,
-    ``checkpoint`` (environment steps), ``mean`` (return; NaN if it is missing), ``reason`` (why it is missing, else empty),
-    ``commit`` and ``versions`` (of all sessions that trained it), ``program`` and ``episodes`` (of an evaluation); empty or
-    0 where that is not known.
-
-    :raises ValueError: when there are none, and as :func:`search.studies.benchmark.read_abouts` does
+    The runs of a benchmark: one row for each checkpoint of each planned run, ``reason`` being why its mean is missing, and
+    ``commit`` and ``versions`` those of all sessions that trained it; empty or 0 where something is not known.
     """
     rows: list[tuple[Any, ...]] = []
     for path, about in read_abouts(folder).items():
@@ -120,11 +112,6 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     For table 6 the returns are normalized as for table 2, see :func:`search.studies.operator_selection.table`, over the
     variants that are complete: if these are not the paper's four, no number of the paper stands beside them. N is 5 seeds x
     6 environments there, so both deviations contain the difference of the environments: the test is a cautious one.
-
-    :param number: 3, 4 or 6, None for no table of the paper
-    :return: One row for each ``checkpoint``, ``environment`` and ``variant``, in their order: ``planned`` and ``runs`` (how
-        many were planned, and are finished), ``mean``, ``std``, ``column`` (the paper's heading), ``paper_mean``,
-        ``paper_std``, ``paper_runs``, ``difference``, ``standard_error`` and ``mark`` (``higher``, ``lower`` or empty)
     """
     keys = ["checkpoint", "environment", "variant"]
     numbers = ["paper_mean", "paper_std", "paper_runs"]

@@ -1,9 +1,8 @@
-"""Trials of a study for plots, notes and reports: their loss, generation, learning curve and ancestors."""
+"""Trials of a study for plots and reports: their loss, generation, learning curve and ancestors."""
 
 import math
 from collections.abc import Iterable, Sequence
 
-from optuna import Trial
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
@@ -21,13 +20,11 @@ def ranked(trials: Iterable[FrozenTrial], direction: StudyDirection = StudyDirec
     return [trial for _, trial in sorted(scores, key=lambda scored: (sign * scored[0], scored[1].number))]
 
 
-def lineage(trial: FrozenTrial | Trial, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-    """All ancestors of a trial. The line through the first parent of each comes first, back to its end."""
-    ancestors: dict[int, FrozenTrial] = {}
-    stack = list(reversed(trial.user_attrs.get("parents", ())))
-    while stack:
-        number = stack.pop()
-        if number not in ancestors:
-            ancestors[number] = trials[number]
-            stack.extend(reversed(trials[number].user_attrs.get("parents", ())))
-    return list(ancestors.values())
+def lineage(trial: FrozenTrial, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+    """All ancestors of a trial, the latest first."""
+    line, wanted = [], set(trial.user_attrs.get("parents", ()))
+    for earlier in reversed(trials[: trial.number]):
+        if earlier.number in wanted:
+            line.append(earlier)
+            wanted |= set(earlier.user_attrs.get("parents", ()))
+    return line

@@ -34,14 +34,8 @@ def load_benchmark(
     imports: Sequence[str] = (),
 ) -> Matrix:
     """
-    Read the variants of a benchmark, and check all that can be checked without training.
-
-    :param environments: Ids or short forms; none for those that all files name
-    :param checkpoints: Environment steps of the comparison; none for those of 100k, 500k and 1000k that lie in
-        every file's ``n_timesteps``
-    :param every: Environment steps after which runs are also evaluated
-    :param imports: Modules that are imported first, such as those that register environments
-    :raises ValueError: naming what is wrong, or which setting differs from that of runs in the folder
+    Read the variants of a benchmark, and check all that can be checked without training. Default environments are those that
+    all files name, default checkpoints those of 100k, 500k and 1000k that lie in every file's ``n_timesteps``.
     """
     for stem, count in Counter(path.stem for path in files).items():
         if count > 1:
@@ -89,12 +83,7 @@ def load_benchmark(
 
 
 def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
-    """
-    The ``provenance.json`` of a benchmark's runs, by their folders, those copied from another machine too.
-
-    :raises ValueError: naming one that cannot be read, two folders that have the same run, or runs of a variant on an
-        environment that were trained in different ways
-    """
+    """The ``provenance.json`` of a benchmark's runs, by their folders, if each run is there once and all can be compared."""
     abouts: dict[Path, dict[str, Any]] = {}
     folders: dict[Cell, Path] = {}
     trained: dict[tuple[str, str], Path] = {}
@@ -117,8 +106,6 @@ def read_curves(folder: Path) -> pd.DataFrame:
     """
     The learning curves of a benchmark's runs: one row an evaluation with ``variant``, ``env`` (short form), ``seed``,
     ``environment_steps``, ``mean`` and ``std`` (of the episodes' returns). Runs without an evaluation are skipped.
-
-    :raises ValueError: when no run has a learning curve
     """
     rows = [
         (about["variant"], task_name(about["environment"]), about["seed"], point.environment_steps, point.mean, point.std)

@@ -24,11 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
-    """
-    The best candidates of a search, the best first, in canonical form and each once.
-
-    :raises ValueError: when no candidate is complete
-    """
+    """The best candidates of a search, the best first, in canonical form and each once."""
     trials = ranked(study.get_trials(deepcopy=False), study.direction)
     losses = dict.fromkeys(loss.canonical() for loss in map(loss_of, trials) if loss is not None)
     if not losses:
@@ -39,10 +35,7 @@ def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
 def make_matrix(
     config: SearchConfig, study: optuna.Study, folder: Path, top: int | None = None, baselines: Sequence[Baseline] = ()
 ) -> Matrix:
-    """
-    The runs of a cross-validation: candidates and baselines x environments x seeds; ``top`` replaces the configuration's
-    number of candidates.
-    """
+    """Candidates and baselines x environments x seeds; ``top`` replaces the configuration's number of candidates."""
     section = _section(config)
     if config.environment in section.environments and (own := sorted({*config.seeds} & {*section.seeds})):
         logger.warning(
@@ -80,10 +73,8 @@ def _make_runs(config: SearchConfig, variants: Sequence[Baseline]) -> dict[Cell,
 
 def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     """
-    The candidates by their mean AULC over all environments (paper, A.4), the best first.
-
-    :return: One row a candidate: mean score on each environment, then ``mean``, ``std`` (sample deviation
-        over seeds of the mean over environments), and ``runs``
+    The candidates by their mean AULC over all environments (paper, A.4), the best first; ``std`` is the sample deviation over
+    seeds of the mean over environments.
     """
     by_environment = runs.pivot_table(index="variant", columns="environment", values="score", aggfunc="mean")
     by_seed = runs.groupby(["variant", "seed"])["score"].mean().groupby("variant")

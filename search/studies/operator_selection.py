@@ -36,9 +36,6 @@ def table(runs: pd.DataFrame) -> pd.DataFrame:
     The paper does not say how returns are normalized. Here each is divided by the size of the mean of all operators on
     its environment, so that environments count alike and higher is better even if returns are negative, and then all by
     the best operator's mean, so that this is 1; unless it is negative.
-
-    :param runs: As returned by :func:`search.execution.matrix.scores`; ``last`` is the return at the last checkpoint
-    :return: One row an operator: ``mean``, ``std``, ``runs``, the best first
     """
     scale = runs.groupby("environment")["last"].transform("mean").abs()
     normalized = (runs["last"] / scale.where(scale != 0, 1.0)).groupby(runs["variant"])

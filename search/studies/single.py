@@ -47,15 +47,8 @@ def prepare_one(
     imports: Sequence[str] = (),
 ) -> Path:
     """
-    Prepare the folder of a run with one loss, which keeps its model, for :func:`search.training.run.train`.
-
-    :param aux_loss: Notation, name or YAML file; ``"none"`` for none; None for what the file of hyper-parameters says, or
-        ``"auto"``
-    :param config: File of hyper-parameters, or name of a shipped one; None for ``aarl_state`` or ``default``
-    :param environment_steps: Environment steps of the run, None for the file's ``n_timesteps``
-    :param imports: Modules that are imported first
-    :return: The folder
-    :raises ValueError: when something is unknown or does not fit, or the folder has another run
+    Prepare the folder of a run with one loss, which keeps its model, for :func:`search.training.run.train`, and return it.
+    ``aux_loss=None`` is that of the file of hyper-parameters, or ``"auto"``; ``"none"`` is none.
     """
     import_modules(imports)
     environment = resolve_env_id(environment)
@@ -95,12 +88,7 @@ def prepare_one(
 def load_trained(
     path: Path, environment: str | None = None, renders: bool = False, imports: Sequence[str] = ()
 ) -> tuple[SACAux, VecEnv]:
-    """
-    A trained model, and an environment for it: that of the run that it is from, or another one.
-
-    :param imports: Modules that are imported first, beside those of the run
-    :raises ValueError: when there is no model, or the environment is not known
-    """
+    """A trained model, and an environment for it: that of the run that it is from, or another one."""
     folder = path if path.is_dir() else path.parent
     model = folder / MODEL if path.is_dir() else path
     if not model.is_file():

@@ -32,9 +32,8 @@ def search_status(study: optuna.Study, folder: Path) -> tuple[driver.SearchProgr
 
 def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     """
-    One row for each variant of a matrix: ``variant``, ``runs``, ``done``, ``running``, ``failed`` and ``score`` (mean AULC of
-    those that are done, None where they are of several environments); and the estimated seconds until all are over, None while
-    that is not known.
+    One row for each variant of a matrix, with the mean AULC of what is done, None where it is of several environments; and the
+    estimated seconds until all are over, None while that is not known.
     """
     runs: dict[str, list[tuple[Outcome | None, bool]]] = defaultdict(list)
     tasks: dict[str, set[str]] = defaultdict(set)

@@ -88,11 +88,7 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
 
 
 def check_hyperparameters(values: Mapping[str, Any], env_id: str, source: str) -> dict[str, Any]:
-    """
-    Hyper-parameters with the types of the arguments that they are: lists are tuples where an argument is one.
-
-    :raises ConfigError: naming the source and the key that is wrong
-    """
+    """Hyper-parameters with the types of the arguments that they are: lists are tuples where an argument is one."""
     refused = [f"{source}: {key}: {reason}" for key, reason in REFUSED.items() if key in values]
     if refused:
         raise ConfigError("\n".join(refused))
@@ -126,11 +122,8 @@ def _read_text(node: ast.expr) -> Any:
 
 def env_wrappers(value: Any) -> list[tuple[str, str, dict[str, Any]]]:
     """
-    Module, name and arguments of each wrapper of ``env_wrapper``, the innermost first.
-
-    :param value: A name, a mapping from one name to arguments, or a list of both; None for no wrapper. A name may have
-        dots before it, as in RL-Zoo's files
-    :raises ValueError: for a name that is not one of ``WRAPPERS``
+    Module, name and arguments of each wrapper of ``env_wrapper``, the innermost first: a name, with dots before it as in
+    RL-Zoo's files or without, a mapping from one name to arguments, or a list of both.
     """
     found = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:
@@ -155,12 +148,7 @@ def action_repeat(hyperparameters: Mapping[str, Any]) -> int:
 
 
 def resolve_env_id(name: str) -> str:
-    """
-    The id of an environment, registered or the short form of a DeepMind Control task, such as ``cheetah-run`` or
-    ``Cheetah-Run``.
-
-    :raises ConfigError: for an unknown one, with the nearest
-    """
+    """The id of an environment, registered or the short form of a DeepMind Control task, such as ``Cheetah-Run``."""
     if name in gym.registry:
         return name
     module, colon, env_id = name.rpartition(":")
@@ -179,11 +167,7 @@ def resolve_env_id(name: str) -> str:
 
 
 def import_modules(names: Sequence[str]) -> Sequence[str]:
-    """
-    Import a user's own modules, which register environments, those in the working directory too, and return their names.
-
-    :raises ConfigError: naming the module that cannot be imported
-    """
+    """Import a user's own modules, which register environments, those in the working directory too; return their names."""
     if str(Path.cwd()) not in sys.path:  # it is there for `python -m`, and not for the program `aarl`
         sys.path.append(str(Path.cwd()))
     for name in names:
@@ -225,11 +209,7 @@ _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """
-    The mapping in a YAML file. Nothing in it is evaluated.
-
-    :raises ConfigError: naming the file, and the line where it is not YAML
-    """
+    """The mapping in a YAML file. Nothing in it is evaluated."""
     try:
         values = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
     except OSError as error:
@@ -245,11 +225,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def validated(model_class: type[Model], values: Mapping[str, Any], source: str) -> Model:
-    """
-    A model of plain values. A number in quotes is text, a truth value is no number; a list will do for a tuple.
-
-    :raises ConfigError: one line for each problem, with the source of the values and the key
-    """
+    """A model of plain values. A number in quotes is text, a truth value is no number; a list will do for a tuple."""
     try:
         # Pydantic's strict mode takes a list for a tuple in JSON only.
         return model_class.model_validate_json(json.dumps(values, default=str), strict=True)

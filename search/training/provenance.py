@@ -95,10 +95,7 @@ def write_about(path: Path, about: Mapping[str, Any]) -> None:
 
 
 def add_session(path: Path, **session: Any) -> None:
-    """
-    Add a session, in which a run is started or resumed, to its ``provenance.json``: values and :func:`provenance`. The
-    command is that of the program which submitted the run, if there is one.
-    """
+    """Add a session, in which a run is started or resumed; its command is that of the program that submitted the run."""
     about = read_about(path)
     session = {**provenance(), **session}
     session["command"] = about.get("command", session["command"])

@@ -156,10 +156,7 @@ def differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, Any,
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any = None, renders: bool = False) -> gym.Env:
-    """
-    An environment with the ``env_kwargs`` of a configuration, of ``make_dmc_env``, or of ``wrap_env`` for any other id, and
-    its ``env_wrapper``. ``renders`` has it render if it observes no pixels, too.
-    """
+    """The environment of a configuration. ``renders`` has it render if it observes no pixels, too."""
     if env_id.startswith(PREFIX):
         env = make_dmc_env(env_id, **env_kwargs)
     else:
@@ -178,11 +175,7 @@ def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
 
 
 def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int = 1) -> tuple[int, ...]:
-    """
-    Equally spaced checkpoints, multiples of an interval; the last is a little early where they do not divide the run.
-
-    :raises ValueError: when there are too few steps for so many checkpoints
-    """
+    """Equally spaced checkpoints, multiples of an interval; the last is a little early where they do not divide the run."""
     if n_evaluations < 1 or environment_steps < n_evaluations * interval:
         raise ValueError(
             f"{environment_steps} environment steps, {interval} at a time, are too few for {n_evaluations} evaluations"
@@ -260,11 +253,7 @@ class Setup:
 
 
 def check_run(run: Run) -> None:
-    """
-    Make environment and model of a run once, and make a step; warn of what a user may not have meant.
-
-    :raises ConfigError: in one line, when that fails
-    """
+    """Make environment and model of a run once, and make a step; warn of what a user may not have meant."""
     try:
         setup = Setup(run, run.environment)
         with closing_env(setup.training_env()) as env:

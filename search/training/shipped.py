@@ -15,12 +15,7 @@ def shipped_files(searches: bool) -> dict[str, Path]:
 
 
 def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path:
-    """
-    A file that is there, or else the shipped one of that name: ``demo``, ``simba/sac_simba``, ``sac_simba``,
-    ``zoo_configs/simba/sac_simba.yml``.
-
-    :raises ValueError: with the nearest name, when there is no such file
-    """
+    """A file that is there, or else the shipped one of that name, such as ``demo``, ``sac_simba``, ``simba/sac_simba``."""
     if (folder / path).is_file():
         return folder / path
     files = shipped_files(searches)
