@@ -344,7 +344,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"overrides": {"policy_kwargs": {"features_extractor_kwargs": {"n_layer": 2}}}},
-        "extractor_kwargs.n_layer: .*'n_layers'",
+        "extractor_kwargs.n_layer: .*'n_blocks'",
     ),
     ({"overrides": {"policy_kwargs": {"features_extractor_class": "dens_mlp"}}}, "features_extractor_class: .*'dense_mlp'"),
     ({"overrides": {"normalize": {"norm_obz": True}}}, "normalize.norm_obz: .*'norm_obs'"),
