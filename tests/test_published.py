@@ -46,7 +46,7 @@ def make_model(observation: str, env: gym.Env, loss: object) -> SACAux:
         aux_loss=loss,
         policy_kwargs={
             "net_arch": [16],
-            "features_extractor_kwargs": {"features_dim": 8, **({"width": 8} if state else {"n_filters": 4})},
+            "features_extractor_kwargs": {"features_dim": 8, **({} if state else {"n_filters": 4})},
         },
         seed=0,
         device="cpu",
