@@ -3,6 +3,7 @@
 import copy
 import logging
 import math
+import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -352,6 +353,7 @@ class SACAux(SAC):
         self._update_learning_rates()
         # Networks compute in bfloat16 if asked to; their outputs, and all that is computed from them, are float32.
         autocast = th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bf16")
+        started = time.perf_counter()
         with self._logged() as log:
             for _ in range(gradient_steps):
                 self._n_updates += 1
@@ -414,6 +416,8 @@ class SACAux(SAC):
                     self._update_target()
                 # Running statistics of the encoder are copied, see SB3's issue 996.
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+                if self.compile and self._n_updates == 1:
+                    logger.info("compile=True: the first gradient step took %.0f s", time.perf_counter() - started)
 
     def _act(self, observations: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
         """Actions of the actor and their log probabilities, (batch, action_dim) and (batch, 1)."""
