@@ -101,7 +101,7 @@ def test_every_baseline_can_be_built(name: str) -> None:
         values.pop("n_timesteps")
         values["policy_kwargs"]["net_arch"] = [8]
         env = make_env(config.environment, values.pop("env_kwargs"))
-        model = SACAux(values.pop("policy"), env, aux_loss=baseline.aux_loss, **{**values, "buffer_size": 10})
+        model = SACAux(values.pop("policy"), env, **{**values, "aux_loss": baseline.aux_loss, "buffer_size": 10})
         assert model.aux_loss == (catalog.load("curl") if "CURL" in baseline.name else None)
         assert bool(list(model.critic.features_extractor.parameters())) is ("Identity" not in baseline.name)
         if "no aug" in baseline.name:
