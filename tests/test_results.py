@@ -212,15 +212,12 @@ def test_figures_of_the_first_readme() -> None:
         assert " | ".join([row, *means]) in readme
     iqm = interquartile_means(read_runs(RESULTS / "simba_cheetah_run")).set_index("variant").loc["forward_simba"]
     assert f"interquartile mean is {iqm['iqm']:.0f}, 95 % interval {iqm['low']:.0f} to {iqm['high']:.0f}" in readme
-    for text, variants, task in (
-        (
-            "AARL-State gets {} on Cheetah-Run, SAC with the same encoder {}",
-            ("aarl_state", "sac_dense_mlp"),
-            "cheetah-run",
-        ),
-        ("on Walker-Walk {} and {}", ("aarl_state", "sac_dense_mlp"), "walker-walk"),
+    for text, task in (
+        ("AARL-State gets {} on Cheetah-Run, SAC with the same encoder {}", "cheetah-run"),
+        ("on Walker-Walk {} and {}", "walker-walk"),
     ):
-        assert text.format(*(shown(last_returns(f"{variant}_small", task)) for variant in variants)) in readme
+        aarl, sac_dense = (shown(last_returns(f"{variant}_small", task)) for variant in ("aarl_state", "sac_dense_mlp"))
+        assert text.format(aarl, sac_dense) in readme
     paper = paper_scores(4).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'").set_index("column")
     for text, variant, column in (
         ("AARL-State gets {} on Cheetah-Run, where the paper has {}", "aarl_state_bf16", "AARL-State"),

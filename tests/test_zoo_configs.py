@@ -264,7 +264,7 @@ def test_builds_and_trains(variant: str, task: str) -> None:
 
     model.train(gradient_steps=2, batch_size=4)  # the second one is the actor's
 
-    name = expected(variant, task).get("aux_loss", "aarl-state" if variant in STATE_VARIANTS else "aarl-pixel")
+    name = expected(variant, task).get("aux_loss", "aarl-pixel")
     assert model.aux_loss == (None if name is None else catalog.load(name))
     logged = model.logger.name_to_value
     assert logged["train/aux_skipped"] == 0 and ("train/aux_loss" in logged) is (name is not None)
