@@ -72,7 +72,7 @@ def load(name: str) -> AuxLoss:
         return _named()[key]
     candidates = {candidate.name: candidate.loss for candidate in published()}
     if key not in candidates:
-        nearest = difflib.get_close_matches(key[:100], [*names(), *candidates], cutoff=0.4)
+        nearest = difflib.get_close_matches(key[:100], [*names(), *candidates])
         hint = f"nearest: {', '.join(nearest)}" if nearest else f"known: {', '.join(names())}"
         raise ValueError(f"unknown auxiliary loss {name!r}, {hint}")
     return candidates[key]

@@ -102,7 +102,7 @@ def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
         return
     found = costs(kinds)
     formats = dict.fromkeys(("runs", "environment steps", "gradient steps"), "{:,}")
-    formats |= dict.fromkeys(("ms an environment step", "ms a gradient step", "hours of a run", "core hours"), "{:.3g}")
+    formats |= dict.fromkeys(("ms an environment step", "ms a gradient step", "hours of a run", "core hours"), "{:.2g}")
     formats["MB of buffer"] = "{:,.1f}"
     shown = pd.DataFrame({name: found[name].map(text.format) for name, text in formats.items()})
     shown.columns = shown.columns.str.replace(" ", "\n")
@@ -112,6 +112,6 @@ def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
     hours = (found["runs"] * found["hours of a run"]).sum() / min(workers, n_runs)
     memory = found["MB of buffer"].max() * min(workers, n_runs)
     say(
-        f"All: {n_runs} runs, {found['core hours'].sum():.3g} core hours; {hours:.3g} hours and at most {memory:,.1f} MB of "
-        f"buffers with --workers {workers}. Nothing was started."
+        f"All: {n_runs} runs, {found['core hours'].sum():.2g} core hours; {hours:.2g} hours and at most {memory:,.1f} MB of "
+        f"buffers with --workers {workers}. Starting each takes some seconds more. Nothing was started."
     )

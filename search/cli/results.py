@@ -144,10 +144,10 @@ def status(
     if json:
         say_json(data)
         return
-    columns = ["variant", "runs", "done", "running", "failed", "score"]
+    columns = ["variant", "runs", "done", "running", "failed"]
     for title, rows in tables.items():
         shown = [
-            {name: str(row.get(name, "")) for name in columns} | {"score": number(row["score"]) if "score" in row else ""}
+            {name: str(row[name]) for name in columns} | {name: number(row[name]) for name in ("score",) if name in row}
             for row in rows
         ]
         show_table(pd.DataFrame(shown), f"{path}, {title}")

@@ -126,8 +126,8 @@ class Driver:
                     return
                 time.sleep(POLL_SECONDS)
         finally:
-            for number in self.running:
-                self._interrupt(number)
+            self.running.clear()
+            self._interrupt_unknown()  # those that ran, and the one of an ask that was interrupted
 
     def _has_room(self) -> bool:
         return sum(running.n_in_flight() for running in self.running.values()) < self.workers

@@ -94,7 +94,8 @@ def _validation(runs: pd.DataFrame | None) -> dict[str, Any] | None:
     if runs is None or comparable(runs).empty:
         return None
     ranking = cross_validation.ranking(comparable(runs))
-    text = ranking.map("{:.1f}".format).assign(runs=ranking["runs"].map("{:.0f}".format)).rename(columns=task_name)
+    text = ranking.map("{:.1f}".format).replace("nan", "-").assign(runs=ranking["runs"].map("{:.0f}".format))
+    text = text.rename(columns=task_name)
     text.insert(0, "Loss", [Markup("<code>{}</code>").format(name) for name in ranking.index])
     return {"ranking": text, "left_out": runs["variant"].nunique() - len(ranking)}
 

@@ -158,7 +158,7 @@ def resolve_env_id(name: str) -> str:
     if full in env_ids():
         return full
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
-    nearest = difflib.get_close_matches(name, known, cutoff=0.4)
+    nearest = difflib.get_close_matches(name, known)
     hint = "" if env_ids() or "-v" in name else f" {NEEDS_DMC}"
     raise ConfigError(
         f"unknown environment {name!r}: a module of yours that registers it belongs to the imports (--imports, or imports: in "

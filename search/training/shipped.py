@@ -24,6 +24,6 @@ def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path
         known for known, file in files.items() if f"/zoo_configs/{file.relative_to(ZOO).with_suffix('')}".endswith(wanted)
     ]
     if len(found) != 1:
-        nearest = found or difflib.get_close_matches(path.stem, files, n=1, cutoff=0.0)
-        raise ValueError(f"{path} is no file, nor the name of one of `aarl configs`, nearest: {', '.join(nearest)}")
+        nearest = found or difflib.get_close_matches(path.stem, files, n=1)
+        raise ValueError(f"{path} is no file, nor the name of one of `aarl configs`, nearest: {', '.join(nearest) or 'none'}")
     return files[found[0]]
