@@ -2,9 +2,9 @@
 What one gradient step costs: SACAux beside SB3's SAC with networks of the same widths and the same batch.
 
 All run in one process and take turns, so that what disturbs the machine disturbs all; ratios are medians of the ratios
-within each round. ``state``: observations and actions of Cheetah-Run, batch 512, two hidden layers of 1024, AARL-State.
-``small``: the same with SB3's sizes, batch 256 and two hidden layers of 256, on one thread; ``simba`` with that encoder and
-forward dynamics.
+within each round. ``state``: observations and actions of Cheetah-Run, batch 512, two hidden layers of 1024, AARL-State and
+DenseMLP. ``small``: the same with SB3's sizes, batch 256 and two hidden layers of 256, on one thread; ``simba``: with that
+encoder, by default with forward dynamics.
 ``pixels``: three stacked frames of 100 x 100 x 3 cropped to 84 x 84, batch 128, AARL-Pixel. SB3's SAC reads pixels of
 84 x 84 through the same encoder class, so that both do the same convolutions. The replay buffers hold random numbers:
 a gradient step costs the same whatever they mean.
@@ -45,7 +45,7 @@ WIDTH = {"state": 1024, "small": 256, "pixels": 1024}
 STEPS = {"state": 6, "small": 40, "pixels": 2}
 REFERENCE_MS, REFERENCE_GFLOPS = {"state": 107, "pixels": 1139}, 220
 TRANSITIONS = {"state": 20_000, "small": 20_000, "pixels": 2000}
-SIMBA = {"policy_kwargs": {"features_extractor_class": "simba"}, "aux_loss": "forward-dynamics"}
+DENSE_MLP: dict[str, Any] = {"policy_kwargs": {"features_extractor_class": "dense_mlp"}}
 PARTS = ("sampling", "critic", "actor", "auxiliary", "targets")
 
 
@@ -115,10 +115,14 @@ def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
 
 def modes(setting: str) -> dict[str, dict[str, Any]]:
     """The ways to run a gradient step, by name."""
-    ways: dict[str, dict[str, Any]] = {"fp32": {}, "bf16": {"precision": "bf16"}}
-    ways |= {f"{name}, compiled": {**kwargs, "compile": True} for name, kwargs in ways.items()}
+    encoder, loss = ({}, "aarl-pixel") if setting == "pixels" else (DENSE_MLP, "aarl-state")
+    precisions: dict[str, dict[str, Any]] = {"fp32": {}, "bf16": {"precision": "bf16"}}
+    precisions |= {f"{name}, compiled": {**kwargs, "compile": True} for name, kwargs in precisions.items()}
+    ways: dict[str, dict[str, Any]] = {"no auxiliary loss": {**encoder, "aux_loss": None}}
+    ways |= {name: {**kwargs, **encoder, "aux_loss": loss} for name, kwargs in precisions.items()}
     if setting == "small":
-        ways |= {f"simba, {name}": {**kwargs, **SIMBA} for name, kwargs in ways.items()}
+        ways |= {"simba, no auxiliary loss": {"aux_loss": None}, "simba, AARL-State": {"aux_loss": "aarl-state"}}
+        ways |= {f"simba, {name}": kwargs for name, kwargs in precisions.items()}
     return ways
 
 
@@ -271,9 +275,8 @@ def main() -> None:
     rows, threads = [], th.get_num_threads()
     for setting in args.settings:
         th.set_num_threads(1 if setting == "small" else threads)
-        variants: dict[str, dict[str, Any]] = {"no auxiliary loss": {"aux_loss": None}, **modes(setting)}
         steps = args.steps or (200 if args.device == "cuda" else STEPS[setting])
-        rows += measure(setting, args.device, variants, args.rounds, steps, args.at_once)
+        rows += measure(setting, args.device, modes(setting), args.rounds, steps, args.at_once)
         show(rows)
     if args.out:
         save_result(args.out, threads=threads, rows=rows)

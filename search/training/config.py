@@ -162,7 +162,7 @@ def resolve_env_id(name: str) -> str:
     hint = "" if env_ids() or "-v" in name else f" {NEEDS_DMC}"
     raise ConfigError(
         f"unknown environment {name!r}: a module of yours that registers it belongs to the imports (--imports, or imports: in "
-        f"the file).{hint} The nearest: {', '.join(nearest) or 'none'}"
+        f"the file).{hint}{' The nearest: ' + ', '.join(nearest) if nearest else ''}"
     )
 
 
