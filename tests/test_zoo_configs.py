@@ -148,6 +148,8 @@ def test_rl_zoo_reads_the_same(path: Path) -> None:
 
 # Batch and hidden layers of SB3's SAC.
 SMALL: dict[str, Any] = {"batch_size": 256, "policy_kwargs": {"net_arch": [256, 256]}}
+REPEAT_2: dict[str, Any] = {"n_timesteps": 50_000, "env_kwargs": {"action_repeat": 2}}
+PUBLIC: dict[str, Any] = {"policy_kwargs": {"ortho_init": True, "squash_log_std": (-10, 2)}}
 # What each file of choices/ changes, and of which variant.
 CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "aarl_state_bf16": ("aarl_state", {"precision": "bf16"}),
@@ -165,11 +167,11 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
     "sac_dense_mlp_small_orthogonal": ("sac_dense_mlp", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
     "sac_identity_small": ("sac_identity", SMALL),
     "sac_identity_small_orthogonal": ("sac_identity", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
-    "sac_identity_small_orthogonal_squashed": (
-        "sac_identity",
-        merge(SMALL, {"policy_kwargs": {"ortho_init": True, "squash_log_std": (-10, 2)}}),
-    ),
+    "sac_identity_small_orthogonal_squashed": ("sac_identity", merge(SMALL, PUBLIC)),
 }
+for name in ("aarl_state", "sac_dense_mlp", "sac_identity"):
+    CHOICES[f"{name}_small_repeat_2"] = (name, {**SMALL, **REPEAT_2})
+    CHOICES[f"{name}_small_orthogonal_squashed_repeat_2"] = (name, {**merge(SMALL, PUBLIC), **REPEAT_2})
 
 
 def test_choices_differ_in_nothing_else() -> None:
