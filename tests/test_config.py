@@ -108,6 +108,14 @@ def test_every_baseline_can_be_built(name: str) -> None:
             assert model.policy.augmentation == "none" and model.observation_space.shape == (9, 84, 84)
 
 
+def test_sac_of_the_template_is_sb3s() -> None:
+    config = load_config(ZOO / "search" / "template.yml")
+    baseline, sac = config.baselines[0], load_hyperparameters(ZOO / "sac.yml", config.environment)
+    assert baseline.aux_loss is sac.pop("aux_loss") is None
+    assert sac.pop("policy") == "MlpPolicy" and sac.pop("n_timesteps")
+    assert config.hyperparameters_for(config.environment, baseline.overrides) == sac
+
+
 def test_all_searches_of_one_kind_have_the_same_baselines() -> None:
     for kind in ("state", "pixel"):
         baselines = {str(load_config(path).baselines) for path in SEARCHES if kind in path.stem}

@@ -213,7 +213,8 @@ class Driver:
         self._tell(trial, state=TrialState.FAIL)
         self.n_failures += 1
         if self.n_failures == MAX_FAILURES:
-            raise RunFailed(f"{MAX_FAILURES} candidates failed one after the other, the last one: {reason}")
+            where = candidate_folder(self.folder, trial)
+            raise RunFailed(f"{MAX_FAILURES} candidates failed one after the other, the last one: {reason} (see {where})")
 
     def _note(self, trial: optuna.Trial, attributes: dict[str, Any]) -> None:
         for name, value in attributes.items():

@@ -96,7 +96,8 @@ def _validation(runs: pd.DataFrame | None) -> dict[str, Any] | None:
     ranking = cross_validation.ranking(comparable(runs))
     text = ranking.map("{:.1f}".format).replace("nan", "-").assign(runs=ranking["runs"].map("{:.0f}".format))
     text = text.rename(columns=task_name)
-    text.insert(0, "Loss", [Markup("<code>{}</code>").format(name) for name in ranking.index])
+    losses = [Markup("<code>{}</code>").format(name) if "->" in name else f"Baseline: {name}" for name in ranking.index]
+    text.insert(0, "Loss", losses)
     return {"ranking": text, "left_out": runs["variant"].nunique() - len(ranking)}
 
 

@@ -182,10 +182,11 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
         return self.path.stem
 
     def hyperparameters_for(self, environment: str, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """The hyper-parameters of a run on an environment, with overrides such as those of a baseline merged over them."""
+        """The hyper-parameters of a run on an environment, with a baseline's overrides merged over them."""
         settings = {} if self.hyperparameters is None else training.load_hyperparameters(self.hyperparameters, environment)
         merged = training.merge(settings, self.overrides)
-        return training.check_hyperparameters(training.merge(merged, overrides or {}), environment, f"{self.path}: overrides")
+        source = f"{self.path}: {'baselines: ' if overrides else ''}overrides"
+        return training.check_hyperparameters(training.merge(merged, overrides or {}), environment, source)
 
     def sampler_settings(self) -> dict[str, Any]:
         """The arguments of ``AuxLossSampler``, the number of generations included."""

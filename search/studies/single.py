@@ -55,7 +55,7 @@ def prepare_one(
     file = find_file(Path(config or ("aarl_state" if environment.startswith(PREFIX) else "default")))
     hyperparameters = load_hyperparameters(file, environment)
     from_file = hyperparameters.pop("aux_loss", "auto")
-    loss = from_file if aux_loss is None else aux_loss
+    named = loss = from_file if aux_loss is None else aux_loss
     if loss in (None, "none"):
         loss = None
     elif loss != "auto":
@@ -77,7 +77,7 @@ def prepare_one(
     )
     if folder is None:
         # A notation may be longer than the name of a file may be.
-        label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {aux_loss or 'auto'}".lower())[:80].strip("-")
+        label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {named or 'none'}".lower())[:80].strip("-")
         folder = Path("runs") / f"{label}-{hashlib.sha256(run.model_dump_json().encode()).hexdigest()[:8]}-seed-{seed}"
     folder = Path(folder)
     check_run(run)

@@ -25,5 +25,6 @@ def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path
     ]
     if len(found) != 1:
         nearest = found or difflib.get_close_matches(path.stem, files, n=1)
-        raise ValueError(f"{path} is no file, nor the name of one of `aarl configs`, nearest: {', '.join(nearest) or 'none'}")
+        hint = f", nearest: {', '.join(nearest)}" if nearest else ""
+        raise ValueError(f"{path} is no file, nor the name of one of `aarl configs`{hint}")
     return files[found[0]]
