@@ -14,7 +14,7 @@ VARIANTS = {
     "forward_simba": "SACAux: forward dynamics, encoder simba",
     "aarl_state_small": "SACAux: the paper's AARL-State and encoder",
     "sac_identity_small": "SAC",
-    "sac": "SAC",
+    "sac_starts_1000": "SAC",
 }
 # Means of 10 seeds at 100,000 environment steps: result files of github.com/dmksjfl/DR.Q, and for MR.Q its own, read on
 # 2026-11-23. DeepMind Control has action repeat 2 there, Gymnasium's tasks are v4.

@@ -206,7 +206,8 @@ BODIES: dict[str, dict[str, Any]] = {
     "body/default_simba_32_entropy_bf16": simba(32) | ENTROPY,
     "simba/aarl_simba": FINALIST,
     "simba/forward_simba_repeat_4": FINALIST | {"aux_loss": "forward-dynamics"},
-    "forward_simba": FINALIST | {"aux_loss": "forward-dynamics", "learning_starts": 1000},
+    "forward_simba": simba(64)
+    | {"aux_loss": "forward-dynamics", "learning_starts": 1000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/aarl_dense_mlp": PAPERS,
     "simba/forward_dense_mlp": PAPERS | {"aux_loss": "forward-dynamics"},
@@ -236,7 +237,8 @@ def test_bodies_differ_from_the_defaults_in_nothing_else() -> None:
             often = env_id.startswith(("dm_control/walker", "dm_control/finger")) and not name.endswith("repeat_4")
             repeat = 2 if often else 4
             steps = {"n_timesteps": 100_000 // repeat, "env_kwargs": {"action_repeat": repeat}}
-            steps |= {"learning_starts": 100} if "learning_starts" in changes else {}
+            if name == "forward_simba":
+                steps |= {"learning_starts": 100, "ent_coef": "auto_0.1", "ent_coef_learning_rate": 3e-4}
             assert load_hyperparameters(path, env_id) == {**defaults, **changes, **steps}
         assert load_hyperparameters(path, "MyEnv-v0") == {**defaults, **changes}
 
