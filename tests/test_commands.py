@@ -144,7 +144,7 @@ def test_init_writes_a_search_that_runs_and_overwrites_nothing(folder: Path) -> 
     assert config.cross_validation and len(config.baselines) == 2
     assert "own.yml" in run("init", "own.yml", code=2) and Path("own.yml").read_text() == text
     # Candidates, baselines, and what is cross-validated.
-    assert f"All: {9 + 2 + 2 * 3} runs" in run("search", "own.yml", "--generations", 1, "--dry-run")
+    assert f"All: {9 + 2 + 2 * (3 + 2)} runs" in run("search", "own.yml", "--generations", 1, "--dry-run")
 
 
 @pytest.mark.slow

@@ -97,7 +97,7 @@ def test_small_searches_are_smaller(path: Path) -> None:
 def test_every_baseline_can_be_built(name: str) -> None:
     config = load_config(ZOO / "search" / f"{name}.yml")
     for baseline in config.baselines:
-        values = config.hyperparameters_for(config.environment, baseline.overrides)
+        values = config.hyperparameters_for(config.environment, baseline)
         values.pop("n_timesteps")
         values["policy_kwargs"]["net_arch"] = [8]
         env = make_env(config.environment, values.pop("env_kwargs"))
@@ -113,7 +113,7 @@ def test_sac_of_the_template_is_sb3s() -> None:
     baseline, sac = config.baselines[0], load_hyperparameters(ZOO / "sac.yml", config.environment)
     assert baseline.aux_loss is sac.pop("aux_loss") is None
     assert sac.pop("policy") == "MlpPolicy" and sac.pop("n_timesteps")
-    assert config.hyperparameters_for(config.environment, baseline.overrides) == sac
+    assert config.hyperparameters_for(config.environment, baseline) == sac
 
 
 def test_all_searches_of_one_kind_have_the_same_baselines() -> None:
@@ -164,7 +164,7 @@ def test_every_part_of_a_search_is_read(tmp_path: Path) -> None:
     assert config.baselines[0] == Baseline(name="a", aux_loss=REWARD)
     assert [baseline.aux_loss for baseline in config.baselines[1:]] == [None, None]
     assert config.operators == ("mse", "inner")
-    assert config.hyperparameters_for("Pendulum-v1", config.baselines[1].overrides) == {
+    assert config.hyperparameters_for("Pendulum-v1", config.baselines[1]) == {
         "env_kwargs": {"action_repeat": 4},
         "batch_size": 64,
         "policy_kwargs": {"net_arch": [7], "features_extractor_class": "identity"},

@@ -105,8 +105,10 @@ def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
     kinds = {config.name: all_runs(config)}
     for cell, run in baselines(config, Path()).runs.items():
         kinds.setdefault(f"baselines: {cell.variant}", []).append(run)
+    names = {baseline.name for baseline in config.baselines}
     for cell, run in cross_validation.all_runs(config).items() if config.cross_validation else ():
-        kinds.setdefault(f"cross-validate: {task_name(cell.environment)}", []).append(run)
+        baseline = f", {cell.variant}" if cell.variant in names else ""
+        kinds.setdefault(f"cross-validate: {task_name(cell.environment)}{baseline}", []).append(run)
     return kinds
 
 

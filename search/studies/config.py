@@ -181,12 +181,14 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
         """The name of the search's study: that of its file."""
         return self.path.stem
 
-    def hyperparameters_for(self, environment: str, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    def hyperparameters_for(self, environment: str, baseline: Baseline | None = None) -> dict[str, Any]:
         """The hyper-parameters of a run on an environment, with a baseline's overrides merged over them."""
         settings = {} if self.hyperparameters is None else training.load_hyperparameters(self.hyperparameters, environment)
         merged = training.merge(settings, self.overrides)
-        source = f"{self.path}: {'baselines: ' if overrides else ''}overrides"
-        return training.check_hyperparameters(training.merge(merged, overrides or {}), environment, source)
+        if baseline is not None:
+            merged = training.merge(merged, baseline.overrides)
+        source = f"{self.path}: {'' if baseline is None else f'baseline {baseline.name}: '}overrides"
+        return training.check_hyperparameters(merged, environment, source)
 
     def sampler_settings(self) -> dict[str, Any]:
         """The arguments of ``AuxLossSampler``, the number of generations included."""
@@ -213,9 +215,8 @@ def load_config(path: str | Path) -> SearchConfig:
     validated = config.cross_validation.environments if config.cross_validation else ()
     own = [config.environment, *(config.operator_selection.environments if config.operator_selection else ())]
     for env_id in dict.fromkeys([*own, *validated]):
-        baselines = config.baselines if env_id == config.environment else ()
-        for overrides in ({}, *(baseline.overrides for baseline in baselines)):
-            interval = checkpoint_interval(config.hyperparameters_for(env_id, overrides))
+        for baseline in (None, *(config.baselines if env_id == config.environment else ())):
+            interval = checkpoint_interval(config.hyperparameters_for(env_id, baseline))
             steps = {*others.get(env_id, config.checkpoints), *(config.checkpoints if env_id in own else ())}
             between = [step for step in sorted(steps) if step % interval]
             if between:

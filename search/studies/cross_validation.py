@@ -50,9 +50,10 @@ def make_matrix(
 
 
 def all_runs(config: SearchConfig) -> dict[Cell, Run]:
-    """The runs of a cross-validation whose candidates are not known yet, each with AARL-State: what it would cost."""
+    """Baselines, and candidates that are not known yet, each with AARL-State: what a cross-validation would cost."""
     loss = catalog.load("aarl-state")
-    return _make_runs(config, [Baseline(name=str(n), aux_loss=loss) for n in range(_section(config).top)])
+    candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(_section(config).top)]
+    return _make_runs(config, [*candidates, *config.baselines])
 
 
 def _section(config: SearchConfig) -> CrossValidation:
@@ -64,7 +65,7 @@ def _section(config: SearchConfig) -> CrossValidation:
 def _make_runs(config: SearchConfig, variants: Sequence[Baseline]) -> dict[Cell, Run]:
     section, runs = _section(config), {}
     for seed, environment, variant in product(section.seeds, section.environments, variants):
-        run = make_run(config, environment, variant.aux_loss, seed, variant.overrides)
+        run = make_run(config, environment, variant.aux_loss, seed, variant)
         # On the search's environment, runs may be longer than those of its candidates.
         checkpoints = section.checkpoints.get(environment, config.checkpoints)
         runs[Cell(variant.name, environment, seed)] = run.model_copy(update={"checkpoints": checkpoints})

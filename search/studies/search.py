@@ -1,7 +1,7 @@
 """The search for auxiliary losses (paper, sections 2.2 and 3): its study, its sampler and the runs of its candidates."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from optuna.trial import TrialState
 from sb3_aarl.aux_loss import AuxLoss
 from search.evolution.sampler import AuxLossSampler
 from search.execution.matrix import Cell, Matrix
-from search.studies.config import SearchConfig
+from search.studies.config import Baseline, SearchConfig
 from search.training.run import FREE, Run, differences
 
 SETTINGS_KEY = "settings"  # user attribute of a study
@@ -28,10 +28,10 @@ def make_run(
     environment: str,
     aux_loss: AuxLoss | None,
     seed: int,
-    overrides: Mapping[str, Any] | None = None,
+    baseline: Baseline | None = None,
 ) -> Run:
-    """A training run with the settings of a search, and overrides merged over its hyper-parameters."""
-    hyperparameters = dict(config.hyperparameters_for(environment, overrides or {}))
+    """A training run with the settings of a search, and a baseline's overrides merged over its hyper-parameters."""
+    hyperparameters = config.hyperparameters_for(environment, baseline)
     hyperparameters.pop("aux_loss", None)
     return Run(
         environment=environment,
@@ -97,7 +97,7 @@ def baselines(config: SearchConfig, folder: Path) -> Matrix:
     """The runs that the candidates are compared with, on the environment and the seeds of the search."""
     environment, runs = config.environment, {}
     for seed, baseline in product(config.seeds, config.baselines):
-        run = make_run(config, environment, baseline.aux_loss, seed, baseline.overrides)
+        run = make_run(config, environment, baseline.aux_loss, seed, baseline)
         runs[Cell(baseline.name, environment, seed)] = run
     return Matrix(f"{config.name}-baselines", folder / "baselines", runs)
 
