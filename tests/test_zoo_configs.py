@@ -207,7 +207,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba/aarl_simba": FINALIST,
     "simba/forward_simba_repeat_4": FINALIST | {"aux_loss": "forward-dynamics"},
     "forward_simba": simba(64)
-    | {"aux_loss": "forward-dynamics", "learning_starts": 1000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4},
+    | {"aux_loss": "forward-dynamics", "learning_starts": 5000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/aarl_dense_mlp": PAPERS,
     "simba/forward_dense_mlp": PAPERS | {"aux_loss": "forward-dynamics"},
