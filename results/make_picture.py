@@ -8,19 +8,20 @@ from search.results.plots import learning_curves_plot
 from search.studies.benchmark import read_curves
 
 RESULTS = Path(__file__).parent
-FOLDERS = ("simba_cheetah_run", "simba", "choices_small", "gymnasium")
+FOLDERS = ("simba_cheetah_run", "simba", "choices_small")
 # What the picture calls each variant. On Walker-Walk action repeat is 2 for the first and 4 for the others.
 VARIANTS = {
     "forward_simba": "SACAux: forward dynamics, encoder simba",
     "aarl_state_small": "SACAux: the paper's AARL-State and encoder",
     "sac_identity_small": "SAC",
-    "sac_starts_1000": "SAC",
+    "sac_starts_5000": "SAC",
 }
 # Means of 10 seeds at 100,000 environment steps: result files of github.com/dmksjfl/DR.Q, and for MR.Q its own, read on
 # 2026-11-23. DeepMind Control has action repeat 2 there, Gymnasium's tasks are v4.
 PUBLISHED = {
     "cheetah-run": {"MR.Q": 648, "SimbaV2": 642, "DR.Q": 638},
     "HalfCheetah-v5": {"DR.Q": 9439, "SimbaV2": 7328},
+    "Hopper-v5": {"SimbaV2": 2821, "DR.Q": 2258},
     "walker-walk": {"SimbaV2": 962, "DR.Q": 936},
 }
 

@@ -196,7 +196,7 @@ def test_figures_of_the_first_readme() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     sac = {
         "cheetah-run": last_returns("sac_identity_small"),
-        **{task: last_returns("sac_starts_1000", task, "gymnasium") for task in ("HalfCheetah-v5", "Hopper-v5")},
+        **{task: last_returns("sac_starts_5000", task, "simba") for task in ("HalfCheetah-v5", "Hopper-v5")},
     }
     forward = {"cheetah-run": last_returns("forward_simba", folder="simba_cheetah_run")}
     for path in (RESULTS / "simba" / "forward_simba").iterdir():
