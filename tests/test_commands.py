@@ -53,6 +53,7 @@ class Unseen(Own):
 
 gym.register("Own-v0", Own, max_episode_steps=20)
 gym.register("Unseen-v0", Unseen, max_episode_steps=20)
+gym.register("Blind-v0", type("Blind", (Own,), {"metadata": {}}), max_episode_steps=20)
 """
 
 
@@ -254,6 +255,7 @@ def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
     assert "which environment?" in run("evaluate", "alone.zip", code=2)
     assert "spaces do not match" in run("evaluate", "alone.zip", "Pendulum-v1", code=2)
     assert "Unseen-v0 cannot be made" in run("video", "alone.zip", "Unseen-v0", code=2)
+    assert "Blind-v0 has no pictures" in run("video", "alone.zip", "Blind-v0", code=2)
     assert "no_env cannot be imported" in run("evaluate", "alone.zip", "Own-v0", "--imports", "no_env", code=2)
     assert "model.zip does not exist" in run("video", trained, code=2)
 
@@ -262,5 +264,7 @@ def test_training_on_an_environment_of_ones_own(folder: Path) -> None:
     (folder / "imported_env.py").write_text(OWN_ENV.replace("Own-v0", "Imported-v0"))
     arguments = ["train", "Imported-v0", "--steps", 300, "--evaluations", 1, "--episodes", 1, "--folder", "run"]
     assert "unknown environment 'Imported-v0'" in run(*arguments, code=2)
+    (folder / "study.db").touch()
+    assert ". is the folder of a search" in run("train", "Pendulum-v1", "--folder", ".", code=2)
     run(*arguments, "--imports", "imported_env")
     assert read_curve("run/curve.csv")[-1].environment_steps == 300

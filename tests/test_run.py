@@ -433,7 +433,7 @@ def test_a_run_too_short_to_learn_is_said_before_it_starts(caplog: pytest.LogCap
     check_run(make_run(hyperparameters=DENSE | {"learning_starts": 64}))
     check_run(make_run(hyperparameters=DENSE | {"learning_starts": 63}))
     assert [record.getMessage() for record in caplog.records] == [
-        "64 agent steps are all random actions: learning_starts is 64"
+        "64 agent steps are all random actions, nothing is learnt: learning_starts is 64"
     ]
 
 

@@ -80,6 +80,8 @@ def prepare_one(
         label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {named or 'none'}".lower())[:80].strip("-")
         folder = Path("runs") / f"{label}-{hashlib.sha256(run.model_dump_json().encode()).hexdigest()[:8]}-seed-{seed}"
     folder = Path(folder)
+    if (folder / "study.db").exists():
+        raise ValueError(f"{folder} is the folder of a search: choose another folder (--folder)")
     check_run(run)
     prepare_run(folder, run)
     return folder
@@ -106,6 +108,8 @@ def load_trained(
         env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
     except TypeError as error:  # Gymnasium's, for an environment that takes no render_mode
         raise ValueError(f"{env_id} cannot be made: {error}") from error
+    if renders and "rgb_array" not in env.get_attr("metadata")[0].get("render_modes", ()):
+        raise ValueError(f"{env_id} has no pictures: its metadata's render_modes are without rgb_array")
     if (folder / NORMALIZE).exists():
         env = VecNormalize.load(str(folder / NORMALIZE), env)
         env.training = env.norm_reward = False

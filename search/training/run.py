@@ -270,7 +270,8 @@ def check_run(run: Run) -> None:
         problem = f"have {setup.episode_steps} environment steps, the horizon of {model.aux_loss} {horizon}"
         raise ConfigError(f"{run.environment} cannot be trained with these settings: episodes {problem}")
     if setup.agent_steps <= learning_starts:
-        logger.warning("%d agent steps are all random actions: learning_starts is %d", setup.agent_steps, learning_starts)
+        message = "%d agent steps are all random actions, nothing is learnt: learning_starts is %d"
+        logger.warning(message, setup.agent_steps, learning_starts)
     apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
     if setup.episode_steps is None:
         logger.warning("%s has no time limit: an evaluation waits until its episodes end", run.environment)
