@@ -12,11 +12,13 @@ import yaml
 from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import InMemoryStorage
 from optuna.trial import create_trial
+from sklearn.linear_model import BayesianRidge
 from tiny import SEARCH, YAML, write_search
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
-from search.evolution.space import distributions, loss_to_params
+from search.evolution.space import distributions, loss_to_params, random_loss
+from search.evolution.surrogate import features
 from search.execution.matrix import Cell
 from search.studies import cross_validation, operator_selection
 from search.studies.config import SearchConfig, load_config
@@ -158,6 +160,20 @@ def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, capl
     assert "seeds has 2, as the search" in caplog.text
     with pytest.raises(ConfigError, match="cross_validation is missing"):
         cross_validation.make_matrix(config.model_copy(update={"cross_validation": None}), study, tmp_path)
+
+
+def test_finalists_that_the_surrogate_rates_highest() -> None:
+    rng = np.random.default_rng(0)
+    losses = list(dict.fromkeys(random_loss(rng, 3).canonical() for _ in range(40)))
+    scores = [100.0 * len(loss.target_tokens) + 100 * rng.normal() for loss in losses]
+    study = optuna.create_study(direction="maximize")
+    for loss, score in zip(losses, scores, strict=True):
+        study.add_trial(create_trial(params=loss_to_params(loss), distributions=distributions(loss.horizon, 3), value=score))
+    rows = features(losses, 3)
+    ratings = BayesianRidge().fit(rows, scores).predict(rows)
+    by_score = np.argsort(scores)[::-1]
+    others = sorted(by_score[4:], key=lambda index: -ratings[index])
+    assert cross_validation.top_losses(study, 4, 3) == [losses[i] for i in (*by_score[:4], *others[:3])]
 
 
 def test_a_ranking_deviates_over_seeds_not_over_environments(tmp_path: Path) -> None:

@@ -60,6 +60,10 @@ class TokenModel:
         """One draw of the weights from the posterior."""
         return self.mean + self.root @ rng.standard_normal(len(self.mean))
 
+    def rating(self, loss: AuxLoss) -> float:
+        """What a loss is worth by the mean of the posterior, in deviations of the scores, but for a constant."""
+        return float((features([loss], self.max_horizon) @ self.mean)[0])
+
     def best(self, losses: Sequence[AuxLoss], weights: np.ndarray) -> int:
         """Index of the loss that the weights of :meth:`draw` rate highest."""
         return int(np.argmax(features(losses, self.max_horizon) @ weights))

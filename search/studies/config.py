@@ -58,13 +58,15 @@ Checkpoints = Annotated[tuple[PositiveInt, ...], AfterValidator(_ascending)]
 
 class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     """
-    Cross-validation of the ``top`` candidates of a search (paper, A.4). ``checkpoints`` are the environment steps of the
-    evaluations on each environment, where they differ from the search's.
+    Cross-validation of the ``top`` candidates of a search (paper, A.4), and of ``top_rated`` others that the surrogate of
+    ``screening`` rates highest: a score of one seed is noisy. ``checkpoints`` are the environment steps of the evaluations on
+    each environment, where they differ from the search's.
     """
 
     environments: Environments
     seeds: Seeds = (0, 1, 2)
     top: PositiveInt = 5
+    top_rated: NonNegativeInt = 0
     checkpoints: dict[Environment, Checkpoints] = {}
 
 

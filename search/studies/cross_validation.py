@@ -8,11 +8,13 @@ from pathlib import Path
 import optuna
 import pandas as pd
 import yaml
+from optuna.study import StudyDirection
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
 from search.evolution.space import loss_of
+from search.evolution.surrogate import TokenModel
 from search.execution.matrix import Cell, Matrix
 from search.results.trials import ranked
 from search.studies.config import Baseline, CrossValidation, SearchConfig
@@ -23,13 +25,21 @@ from search.training.run import Run
 logger = logging.getLogger(__name__)
 
 
-def top_losses(study: optuna.Study, top: int) -> list[AuxLoss]:
-    """The best candidates of a search, the best first, in canonical form and each once."""
+def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLoss]:
+    """
+    The best candidates of a search by their scores, the best first, and after them ``top_rated`` others that the surrogate,
+    fitted to all scores, rates highest; in canonical form and each once.
+    """
+    sign = 1.0 if study.direction == StudyDirection.MAXIMIZE else -1.0
     trials = ranked(study.get_trials(deepcopy=False), study.direction)
-    losses = dict.fromkeys(loss.canonical() for loss in map(loss_of, trials) if loss is not None)
-    if not losses:
+    scores = [(loss.canonical(), sign * (trial.value or 0.0)) for trial in trials if (loss := loss_of(trial)) is not None]
+    if not scores:
         raise ValueError(f"study {study.study_name!r} has no completed candidate yet")
-    return list(losses)[:top]
+    losses = list(dict.fromkeys(loss for loss, _ in scores))
+    surrogate = TokenModel(max(loss.horizon for loss in losses))
+    surrogate.add(*zip(*scores, strict=True))
+    rated = sorted(losses[top:], key=surrogate.rating, reverse=True)
+    return losses[:top] + rated[:top_rated]
 
 
 def make_matrix(
@@ -43,7 +53,7 @@ def make_matrix(
             ", ".join(map(str, own)),
             config.environment,
         )
-    losses = top_losses(study, section.top if top is None else top)
+    losses = top_losses(study, section.top, section.top_rated) if top is None else top_losses(study, top)
     candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
     runs = _make_runs(config, [*candidates, *baselines])
     return Matrix(f"{study.study_name}-cross-validation", folder / "cross-validation", runs)
@@ -51,8 +61,8 @@ def make_matrix(
 
 def all_runs(config: SearchConfig) -> dict[Cell, Run]:
     """Baselines, and candidates that are not known yet, each with AARL-State: what a cross-validation would cost."""
-    loss = catalog.load("aarl-state")
-    candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(_section(config).top)]
+    loss, section = catalog.load("aarl-state"), _section(config)
+    candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(section.top + section.top_rated)]
     return _make_runs(config, [*candidates, *config.baselines])
 
 
