@@ -28,7 +28,7 @@ import numpy as np
 
 
 class Own(gym.Env):
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata = {"render_modes": ["rgb_array"]}
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
 
@@ -245,7 +245,6 @@ def test_a_model_is_evaluated_as_in_its_run(trained: Path) -> None:
 def test_a_video_of_a_model(trained: Path) -> None:
     assert "20 pictures" in run("video", trained)
     assert imageio.imread(trained / "video.gif", index=None).shape == (20, 32, 32, 3)
-    assert imageio.immeta(trained / "video.gif")["duration"] == 50  # milliseconds: the environment has 20 pictures a second
     run("video", trained / "model.zip", "--out", "deep/film.mp4", "--episodes", 2)
     assert imageio.improps("deep/film.mp4", plugin="FFMPEG").shape[1:] == (32, 32, 3)
 

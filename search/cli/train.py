@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sb3_aarl.callbacks import Evaluation
 
 app = typer.Typer()
-FPS = 30  # pictures a second of a video, where the environment has no render_fps
+FPS = 30  # pictures a second of a video
 ModelEnv = Annotated[str | None, typer.Argument(help="Environment. Default: that of the model's run.")]
 
 
@@ -146,7 +146,7 @@ def evaluate(
     """Show the return of a trained model: mean and deviation of episodes with its best actions."""
     import numpy as np
 
-    returns, _ = play(model, env, episodes, seed, imports)
+    returns = play(model, env, episodes, seed, imports)
     if json:
         say_json({"mean": float(np.mean(returns)), "std": float(np.std(returns)), "returns": returns})
     else:
@@ -164,32 +164,28 @@ def video(
         Path | None, typer.Option(help=".gif, or .mp4 (pip install imageio-ffmpeg). Default: video.gif beside the model.")
     ] = None,
 ) -> None:
-    """Film a trained model, whose environment takes render_mode."""
+    """Film a trained model, whose environment takes render_mode, at 30 pictures a second."""
     import imageio.v3 as imageio
 
     path = out or (model if model.is_dir() else model.parent) / "video.gif"
     frames: list[Any] = []
-    returns, fps = play(model, env, episodes, seed, imports, frames)
+    returns = play(model, env, episodes, seed, imports, frames)
     path.parent.mkdir(parents=True, exist_ok=True)
     # GIF counts in milliseconds, and repeats.
-    speed: dict[str, Any] = {"duration": 1000 / fps, "loop": 0} if path.suffix == ".gif" else {"fps": fps}
-    imageio.imwrite(path, frames, **speed)
+    imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix == ".gif" else {"fps": FPS}))
     say(f"Video: {path}, {len(frames)} pictures, returns {', '.join(f'{value:.1f}' for value in returns)}")
 
 
-def play(
-    model: Path, env: str | None, episodes: int, seed: int, imports: str, frames: list[Any] | None = None
-) -> tuple[list[float], float]:
-    """The returns of a model's episodes, pictures a second of the environment, and, where wanted, the pictures."""
+def play(model: Path, env: str | None, episodes: int, seed: int, imports: str, frames: list[Any] | None = None) -> list[float]:
+    """The returns of a model's episodes, and, where wanted, their pictures."""
     from stable_baselines3.common.evaluation import evaluate_policy
 
     from search.studies.single import load_trained
 
     trained, environment = load_trained(model, env, frames is not None, modules(imports))
     environment.seed(seed)
-    fps = environment.get_attr("metadata")[0].get("render_fps", FPS)
     film = None if frames is None else lambda *_: frames.append(environment.render())
     returns, _ = evaluate_policy(trained, environment, episodes, callback=film, return_episode_rewards=True)
     environment.close()
     assert isinstance(returns, list)
-    return [float(value) for value in returns], fps
+    return [float(value) for value in returns]
