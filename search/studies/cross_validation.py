@@ -30,15 +30,17 @@ def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLos
     The best candidates of a search by their scores, the best first, and after them ``top_rated`` others that the surrogate,
     fitted to all scores, rates highest; in canonical form and each once.
     """
-    sign = 1.0 if study.direction == StudyDirection.MAXIMIZE else -1.0
-    trials = ranked(study.get_trials(deepcopy=False), study.direction)
-    scores = [(loss.canonical(), sign * (trial.value or 0.0)) for trial in trials if (loss := loss_of(trial)) is not None]
+    scores = [
+        (loss.canonical(), trial.value)
+        for trial in ranked(study.get_trials(deepcopy=False), study.direction)
+        if (loss := loss_of(trial)) is not None and trial.value is not None
+    ]
     if not scores:
         raise ValueError(f"study {study.study_name!r} has no completed candidate yet")
     losses = list(dict.fromkeys(loss for loss, _ in scores))
     surrogate = TokenModel(max(loss.horizon for loss in losses))
     surrogate.add(*zip(*scores, strict=True))
-    rated = sorted(losses[top:], key=surrogate.rating, reverse=True)
+    rated = sorted(losses[top:], key=surrogate.rating, reverse=study.direction == StudyDirection.MAXIMIZE)
     return losses[:top] + rated[:top_rated]
 
 
