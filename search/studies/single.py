@@ -80,7 +80,7 @@ def prepare_one(
         label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {named or 'none'}".lower())[:80].strip("-")
         folder = Path("runs") / f"{label}-{hashlib.sha256(run.model_dump_json().encode()).hexdigest()[:8]}-seed-{seed}"
     folder = Path(folder)
-    if (folder / "study.db").exists():
+    if (folder / "study.db").exists():  # search.execution.storage, which has the name, needs Optuna
         raise ValueError(f"{folder} is the folder of a search: choose another folder (--folder)")
     check_run(run)
     prepare_run(folder, run)
