@@ -23,6 +23,7 @@ from gymnasium.wrappers import (
     TransformAction,
     TransformObservation,
 )
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 
 
 def _choose_renderer() -> None:
@@ -132,6 +133,11 @@ def make_dmc_env(
         env = TimeLimit(env, EPISODE_LENGTH)
         assert isinstance(env.action_space, spaces.Box)
         env = TransformAction(env, lambda action: action, spaces.Box(-1.0, 1.0, env.action_space.shape, np.float64))
+    if not pixels:
+        env = FlattenObservation(env)
+        assert isinstance(env.observation_space, spaces.Box)
+        low, high = (bound.astype(np.float32) for bound in (env.observation_space.low, env.observation_space.high))
+        env = TransformObservation(env, lambda vector: vector.astype(np.float32), spaces.Box(low, high, dtype=np.float32))
     env = wrap_env(env, pixels=pixels, action_repeat=action_repeat, frame_stack=frame_stack)
     env.action_space.seed(seed)
     return env
@@ -139,12 +145,13 @@ def make_dmc_env(
 
 def wrap_env(env: gym.Env, *, pixels: bool = False, action_repeat: int = 1, frame_stack: int = 1) -> gym.Env:
     """
-    Action repeat, flat float32 vectors or images, and frame stack, in the order that ``WindowReplayBuffer`` needs.
+    Action repeat, rendered images, channels before height and width, and frame stack, in the order that
+    ``WindowReplayBuffer`` needs.
 
     :param env: Any Gymnasium environment; for ``pixels`` with ``render_mode="rgb_array"``
-    :param pixels: As in :func:`make_dmc_env`; images are of the size that the environment renders
+    :param pixels: Whether to observe what the environment renders, in that size, and not what it observes
     :param action_repeat: As in :func:`make_dmc_env`
-    :param frame_stack: As in :func:`make_dmc_env`
+    :param frame_stack: As in :func:`make_dmc_env`, for a vector or an image
     """
     for name, value in (("action_repeat", action_repeat), ("frame_stack", frame_stack)):
         if value < 1:
@@ -154,16 +161,14 @@ def wrap_env(env: gym.Env, *, pixels: bool = False, action_repeat: int = 1, fram
     if pixels:
         # Outside the action repeat: one picture for each agent step.
         env = AddRenderObservation(env, render_only=True)
-        height, width, channels = env.observation_space.shape  # type: ignore[misc]
+    space = env.observation_space
+    if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
+        height, width, channels = space.shape
         channel_first = spaces.Box(0, 255, (channels, height, width), np.uint8)
         env = TransformObservation(env, lambda image: np.ascontiguousarray(image.transpose(2, 0, 1)), channel_first)
-    else:
-        env = FlattenObservation(env)
-        assert isinstance(env.observation_space, spaces.Box)
-        low, high = (bound.astype(np.float32) for bound in (env.observation_space.low, env.observation_space.high))
-        env = TransformObservation(env, lambda vector: vector.astype(np.float32), spaces.Box(low, high, dtype=np.float32))
     if frame_stack > 1:
-        assert env.observation_space.shape is not None
+        if not env.observation_space.shape:
+            raise ValueError(f"frame_stack is for vectors and images, not for {env.observation_space}")
         first, *rest = env.observation_space.shape
         env = ReshapeObservation(FrameStackObservation(env, frame_stack), (frame_stack * first, *rest))
     return env

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -235,6 +236,16 @@ def test_what_cannot_be_searched_is_refused_before_anything_is_made(
     assert not Path("runs").exists()
 
 
+def test_a_folder_is_that_of_one_search(folder: Path, executor: Executor) -> None:
+    write_search(folder, SMALLER + "cross_validation: {environments: [Pendulum-v1]}\n")
+    output = run("search", "small.yml", "--generations", 1, "--folder", "mine")
+    assert output.endswith(" small.yml --folder mine\n")
+    shutil.copy("small.yml", "other.yml")
+    assert "mine is the folder of the search small" in run("search", "other.yml", "--folder", "mine", code=2)
+    assert "small" in run("cross-validate", "other.yml", "--folder", "mine", code=2)
+    assert "mine, search" in run("status", "small.yml", "--folder", "mine")
+
+
 def test_errors_have_no_password(folder: Path) -> None:
     write_search(folder)
     error = run("search", "small.yml", "--storage", "postgresql+psycopg://me:s3cret@127.0.0.1:1/none", code=2)
@@ -338,7 +349,9 @@ def test_a_cross_validation_without_any_run_has_no_winner(searched: optuna.Study
 
 
 def test_cross_validation_needs_a_search(searched: optuna.Study) -> None:
-    assert "elsewhere" in run("cross-validate", "small.yml", "--folder", "elsewhere", code=2)
+    assert "elsewhere/study.db does not exist. aarl search" in run(
+        "cross-validate", "small.yml", "--folder", "elsewhere", code=2
+    )
     assert not Path("elsewhere").exists()
 
 

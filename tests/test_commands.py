@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from tiny import HYPERPARAMETERS, SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
 
 import search.cli.console
+from sb3_aarl import SACAux
 from sb3_aarl.callbacks import read_curve
 from search.cli.main import app
 from search.studies.config import load_config
@@ -51,8 +53,24 @@ class Unseen(Own):
         pass
 
 
+class Image(Own):
+    observation_space = gym.spaces.Box(0, 255, (40, 40, 3), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), super().reset(seed=seed)[1]
+
+    def step(self, action):
+        return self.observation_space.sample(), *super().step(action)[1:]
+
+
+class Parts(Image):
+    observation_space = gym.spaces.Dict(image=Image.observation_space, speed=gym.spaces.Box(-1, 1, (2,), np.float64))
+
+
 gym.register("Own-v0", Own, max_episode_steps=20)
 gym.register("Unseen-v0", Unseen, max_episode_steps=20)
+gym.register("Image-v0", Image, max_episode_steps=20)
+gym.register("Parts-v0", Parts, max_episode_steps=20)
 gym.register("Blind-v0", type("Blind", (Own,), {"metadata": {}}), max_episode_steps=20)
 """
 
@@ -268,3 +286,16 @@ def test_training_on_an_environment_of_ones_own(folder: Path) -> None:
     assert ". is the folder of a search" in run("train", "Pendulum-v1", "--folder", ".", code=2)
     run(*arguments, "--imports", "imported_env")
     assert read_curve("run/curve.csv")[-1].environment_steps == 300
+
+
+@pytest.mark.parametrize(
+    ("env", "policy"), [("Own-v0", "MlpPolicy"), ("Image-v0", "CnnPolicy"), ("Parts-v0", "MultiInputPolicy")]
+)
+def test_observations_are_trained_on_as_they_are(env: str, policy: str, folder: Path) -> None:
+    (folder / "own_env.py").write_text(OWN_ENV)
+    run("train", env, "--imports", "own_env", "--steps", 40, "--evaluations", 1, "--folder", "run")
+    assert "mean and deviation" in run("evaluate", "run")
+    trained = SACAux.load("run/model.zip", gym.make(env))
+    assert trained.policy_class is SACAux.policy_aliases[policy]
+    SACAux(policy, gym.make(env), buffer_size=40).save("own.zip")
+    assert "mean and deviation" in run("evaluate", "own.zip", env)

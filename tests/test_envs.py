@@ -168,6 +168,20 @@ def test_counts_below_one_are_refused(argument: str) -> None:
         wrap_env(gym.make("Pendulum-v1"), **{argument: 0})
 
 
+def test_images_are_stacked_along_their_channels() -> None:
+    class Image(gym.Wrapper):
+        observation_space = spaces.Box(0, 255, (40, 40, 3), np.uint8)
+
+        def reset(self, **_: Any) -> Any:
+            return np.full((40, 40, 3), [0, 1, 2], np.uint8), {}
+
+    env = wrap_env(Image(gym.make("Pendulum-v1")), frame_stack=2)
+    assert env.observation_space == spaces.Box(0, 255, (6, 40, 40), np.uint8)
+    np.testing.assert_array_equal(env.reset()[0][:, 7, 9], [0, 1, 2, 0, 1, 2])
+    with pytest.raises(ValueError, match="frame_stack is for vectors and images, not for Discrete"):
+        wrap_env(gym.make("FrozenLake-v1"), frame_stack=2)
+
+
 def test_other_environments_are_wrapped_alike() -> None:
     env = wrap_env(gym.make("Pendulum-v1"), action_repeat=2, frame_stack=2)
     raw = gym.make("Pendulum-v1")

@@ -153,7 +153,7 @@ def test_analyze_compares_studies(study: optuna.Study) -> None:
         (["figures", "patterns", "--pattern", "curll"], "nearest: curl"),
         (["figures", "evolution", "--out", "x.txt"], "Format 'txt' is not supported"),
         (["figures", "curves"], "runs/benchmark has no learning curves"),
-        (["figures", "evolution", "runs/benchmark"], "runs/benchmark has no study"),
+        (["figures", "evolution", "runs/benchmark"], "runs/benchmark has no search"),
     ],
     ids=["folder", "study", "pattern", "name", "kind", "benchmark", "no search"],
 )

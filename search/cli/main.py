@@ -1,5 +1,6 @@
 """The program ``aarl``. What the commands do lies elsewhere; imports that take seconds are made when they are needed."""
 
+import logging
 import signal
 import sys
 from importlib import metadata
@@ -84,6 +85,7 @@ def program(
 
 def main() -> None:
     """Run the program. SIGTERM, with which clusters announce the end of a job, is an interruption like Ctrl-C."""
+    logging.basicConfig(format="%(message)s")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     app()
 

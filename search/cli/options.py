@@ -78,8 +78,6 @@ def search_folder(folder: Path | None, storage: str | None) -> Path | None:
     if folder is not None:
         named = run_folder(folder, None)
         is_config = folder.suffix in (".yml", ".yaml") or (not folder.exists() and named.exists())
-        if is_config and storage is None and not named.exists():
-            raise ValueError(f"{folder} has no search here: {named} does not exist. aarl search {folder} starts one")
         return named if is_config else folder
     if storage is not None:
         return None

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from search.cli import options
 from search.cli.console import console, print_wide, records, say, say_json, show_table, time_to_go
-from search.cli.options import Storage, open_studies, search_folder
+from search.cli.options import Folder, Storage, open_studies, search_folder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,10 +103,11 @@ def analyze(
 
 @app.command(rich_help_panel="A search")
 def status(
-    folder: Annotated[
+    search: Annotated[
         Path | None, typer.Argument(help="Folder of a search or a benchmark, or a search's file. Default: the only search.")
     ] = None,
     storage: Storage = None,
+    folder: Folder = None,
     json: options.Json = False,
 ) -> None:
     """Show how far a search, what belongs to it, or a benchmark is: runs done, running, failed, best so far, time to go."""
@@ -115,6 +116,7 @@ def status(
     from search.execution.storage import STUDY_FILE
     from search.studies.status import PARTS, matrix_status, search_status
 
+    folder = folder or search
     path = search_folder(folder, storage)
     data: dict[str, Any] = {}
     lines = []
@@ -140,7 +142,7 @@ def status(
             tables[part or "benchmark"] = found.to_dict("records")
             lines.append(f"{(part or 'benchmark').capitalize()}: {time_to_go(to_go)}")
     if not tables:
-        raise ValueError(f"{path} has neither a search nor a benchmark")
+        raise ValueError(f"{path} has neither a search nor a benchmark. aarl search starts one")
     if json:
         say_json(data)
         return
@@ -162,15 +164,16 @@ def number(value: float | None) -> str:
 
 @app.command(rich_help_panel="A search")
 def report(
-    folder: options.SearchFolder = None,
+    search: options.SearchFolder = None,
     storage: Storage = None,
+    folder: Folder = None,
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
     """Write a report of a search as one HTML file."""
     from search.execution.matrix import stored_scores
     from search.results.report import stored_baselines, write_report
 
-    ((searched, path),) = open_studies([folder], storage).values()
+    ((searched, path),) = open_studies([folder or search], storage).values()
     out = out or path / "report.html"
     write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"))
     say(f"Report: {out}")
@@ -178,8 +181,9 @@ def report(
 
 @app.command(rich_help_panel="A search")
 def dashboard(
-    folder: options.SearchFolder = None,
+    search: options.SearchFolder = None,
     storage: Storage = None,
+    folder: Folder = None,
     host: Annotated[
         str, typer.Option(help="Address to listen on; the default is reached from this machine only.")
     ] = "127.0.0.1",
@@ -193,7 +197,7 @@ def dashboard(
     from search.results.report import stored_baselines
     from search.studies.search import SETTINGS_KEY
 
-    path = search_folder(folder, storage)
+    path = search_folder(folder or search, storage)
     opened = open_storage(path, storage, create=False)
     for name in (found.study_name for found in opened.get_all_studies()):
         study = load_study(opened, name)

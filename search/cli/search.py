@@ -54,7 +54,7 @@ def search(
     if executor == "local" and (named := [name for name, value in of_ray.items() if value is not None]):
         raise ValueError(f"--{named[0]} needs --executor ray")
 
-    from optuna import logging
+    from optuna import get_all_study_names, logging
 
     from search.execution.driver import Driver
     from search.execution.runs import LocalExecutor
@@ -72,9 +72,12 @@ def search(
         return
     path = run_folder(config, folder)
     opened = open_storage(path, storage)
+    others = {name for name in get_all_study_names(opened) if name != settings.name} if storage is None else ()
+    if others:
+        raise ValueError(f"{path} is the folder of the search {', '.join(others)}: choose another folder (--folder)")
     study, _ = open_search(settings, opened)
-    option = "" if storage is None else f" --storage {hide_password(storage)}"
-    say(f"Study {settings.name}. To watch it: aarl dashboard {path}{option}")
+    options = "" if storage is None else f" --storage {hide_password(storage)}"
+    say(f"Study {settings.name}. To watch it: aarl dashboard {path}{options}")
     running: Any
     if executor == "ray":
         from search.execution.ray import RayExecutor
@@ -93,7 +96,8 @@ def search(
     if shown.best is not None:
         say(f"Best: {shown.best_loss}, score {shown.best:.2f}")
         if settings.cross_validation:
-            say(f"Does it hold with other seeds? aarl cross-validate {config}")
+            options += "" if folder is None else f" --folder {folder}"
+            say(f"Does it hold with other seeds? aarl cross-validate {config}{options}")
 
 
 def planned(config: "SearchConfig") -> "dict[str, list[Run]]":

@@ -25,7 +25,7 @@ def open_storage(folder: Path | None, url: str | None = None, create: bool = Tru
             raise ValueError("name the folder of a search, or the URL of its storage")
         path = folder / STUDY_FILE
         if not create and not path.exists():
-            raise ValueError(f"{folder} has no study: {path} does not exist")
+            raise ValueError(f"{folder} has no search: {path} does not exist. aarl search starts one")
         folder.mkdir(parents=True, exist_ok=True)
         url = f"sqlite:///{path}"
     engine: dict[str, Any] = {"pool_pre_ping": True}  # a connection that a restarted server has closed is opened again

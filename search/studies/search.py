@@ -78,7 +78,7 @@ def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Stud
         load_if_exists=True,
     )
     if difference := _difference(study, config):
-        advice = "Another search needs a file of another name, or another storage"
+        advice = "Another search needs a file of another name, another folder or another storage"
         raise ValueError(f"study {study.study_name!r} is not this search: {difference}. {advice}")
     study.set_user_attr(SETTINGS_KEY, settings(config))
     return study, sampler

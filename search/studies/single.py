@@ -54,6 +54,8 @@ def prepare_one(
     environment = resolve_env_id(environment)
     file = find_file(Path(config or ("aarl_state" if environment.startswith(PREFIX) else "default")))
     hyperparameters = load_hyperparameters(file, environment)
+    if config is None:
+        hyperparameters.pop("policy", None)  # the one that fits the observations
     from_file = hyperparameters.pop("aux_loss", "auto")
     named = loss = from_file if aux_loss is None else aux_loss
     if loss in (None, "none"):

@@ -19,7 +19,9 @@ import numpy as np
 import pydantic
 import torch as th
 from filelock import FileLock, Timeout
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
@@ -210,16 +212,16 @@ class Setup:
         self.env_kwargs: dict[str, Any] = settings.pop("env_kwargs", None) or {}
         self.env_wrapper = settings.pop("env_wrapper", None)
         self.pixels = self.env_kwargs.get("pixels", False)
-        self.policy = settings.pop("policy", "CnnPolicy" if self.pixels else "MlpPolicy")
+        self.policy = settings.pop("policy", None)
         self.n_envs, self.vec_env = settings.pop("n_envs", 1), VEC_ENVS[settings.pop("vec_env", "dummy")]
         normalize = settings.pop("normalize", False)
         self.normalize: dict[str, Any] | None = {} if normalize is True else normalize if normalize is not False else None
         if self.normalize is not None and "gamma" in settings:  # as in RL-Zoo
             self.normalize = {"gamma": settings["gamma"], **self.normalize}
         self.agent_steps = run.checkpoints[-1] // self.action_repeat
-        if "buffer_size" in settings:
-            # The same run with a smaller checkpoint; each environment has an equal share of the buffer.
-            settings["buffer_size"] = min(settings["buffer_size"], math.ceil(self.agent_steps / self.n_envs) * self.n_envs)
+        # The same run with less memory and a smaller checkpoint; each environment has an equal share of the buffer.
+        needed = math.ceil(self.agent_steps / self.n_envs) * self.n_envs
+        settings["buffer_size"] = min(settings.get("buffer_size", needed), needed)
         if settings.get("compile") and self.agent_steps < COMPILED_STEPS:
             settings["compile"] = False
         for key, value in settings.items():
@@ -249,7 +251,10 @@ class Setup:
         return env if self.normalize is None else VecNormalize(env, **{**self.normalize, **FIXED})
 
     def model(self, env: VecEnv) -> SACAux:
-        return SACAux(self.policy, env, **self.settings)
+        fitting = "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
+        if isinstance(env.observation_space, spaces.Dict):
+            fitting = "MultiInputPolicy"
+        return SACAux(self.policy or fitting, env, **self.settings)
 
 
 def check_run(run: Run) -> None:
