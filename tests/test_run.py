@@ -101,10 +101,10 @@ def run_program(folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str) ->
 @pytest.mark.parametrize(
     ("changes", "key"),
     [
-        ({"seed": 4}, "seed is 3 there, not 4"),
-        ({"checkpoints": (32, 96)}, r"checkpoints is \[32, 64\] there, not \[32, 96\]"),
-        ({"hyperparameters": DENSE | {"batch_size": 8}}, "hyperparameters.batch_size is 16 there, not 8"),
-        ({"hyperparameters": DENSE | {"gamma": 0.9}}, "hyperparameters.gamma is None there, not 0.9"),
+        ({"seed": 4}, "seed is 3 there, 4 here"),
+        ({"checkpoints": (32, 96)}, r"checkpoints is \[32, 64\] there, \[32, 96\] here"),
+        ({"hyperparameters": DENSE | {"batch_size": 8}}, "hyperparameters.batch_size is 16 there, 8 here"),
+        ({"hyperparameters": DENSE | {"gamma": 0.9}}, "hyperparameters.gamma is not set there, 0.9 here"),
         ({"hyperparameters": DENSE | {"policy_kwargs": {"net_arch": [9]}}}, "hyperparameters.policy_kwargs.net_arch"),
     ],
     ids=["seed", "checkpoints", "batch_size", "gamma", "nested"],

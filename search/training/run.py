@@ -109,8 +109,9 @@ def prepare_run(folder: Path, run: Run) -> None:
         stored = read_run(folder).model_dump(mode="json")
         for key, ours, theirs in differences(values, stored):
             if key not in [f"hyperparameters.{name}" for name in FREE]:
+                there, here = ("not set" if value is None else repr(value) for value in (theirs, ours))
                 raise ValueError(
-                    f"{folder} has another run: {key} is {theirs!r} there, not {ours!r}. Choose another folder (--folder)"
+                    f"{folder} has another run: {key} is {there} there, {here} here. Choose another folder (--folder)"
                 )
     replace_text(folder / RUN, json.dumps(values, indent=1) + "\n")
     for name in (STOP, FAILED):
