@@ -326,6 +326,9 @@ def test_the_replay_buffer_is_no_larger_than_the_run(tmp_path: Path, monkeypatch
         with pytest.raises(ZeroDivisionError):
             train(tmp_path / str(n_envs))
         assert sizes[-1] == size
+    unset = {name: value for name, value in DENSE.items() if name != "buffer_size"}
+    long = make_run(hyperparameters=unset, checkpoints=(2_000_000,))
+    assert Setup(long, "test").settings["buffer_size"] == 1_000_000  # SB3's default
 
 
 def test_tensorboard_has_every_evaluation_of_a_short_run(tmp_path: Path) -> None:

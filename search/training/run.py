@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import functools
 import importlib
+import inspect
 import json
 import logging
 import math
@@ -221,8 +222,9 @@ class Setup:
             self.normalize = {"gamma": settings["gamma"], **self.normalize}
         self.agent_steps = run.checkpoints[-1] // self.action_repeat
         # The same run with less memory and a smaller checkpoint; each environment has an equal share of the buffer.
+        default = inspect.signature(SACAux).parameters["buffer_size"].default
         needed = math.ceil(self.agent_steps / self.n_envs) * self.n_envs
-        settings["buffer_size"] = min(settings.get("buffer_size", needed), needed)
+        settings["buffer_size"] = min(settings.get("buffer_size", default), needed)
         if settings.get("compile") and self.agent_steps < COMPILED_STEPS:
             settings["compile"] = False
         for key, value in settings.items():
