@@ -241,9 +241,9 @@ def test_the_version() -> None:
 @pytest.fixture
 def trained(folder: Path) -> Path:
     """A run of 400 steps whose model was kept, with running statistics."""
-    (folder / "own_env.py").write_text(OWN_ENV)
+    (folder / "commands_env.py").write_text(OWN_ENV)
     settings = {**HYPERPARAMETERS, "normalize": True}
-    own = tiny_run(environment="Own-v0", imports=("own_env",), keep_model=True, checkpoints=(100,), hyperparameters=settings)
+    own = tiny_run(environment="Own-v0", imports=("commands_env",), keep_model=True, checkpoints=(100,), hyperparameters=settings)
     prepare_run(Path("trained"), own)
     train(Path("trained"))
     return Path("trained")
@@ -292,8 +292,8 @@ def test_training_on_an_environment_of_ones_own(folder: Path) -> None:
     ("env", "policy"), [("Own-v0", "MlpPolicy"), ("Image-v0", "CnnPolicy"), ("Parts-v0", "MultiInputPolicy")]
 )
 def test_observations_are_trained_on_as_they_are(env: str, policy: str, folder: Path) -> None:
-    (folder / "own_env.py").write_text(OWN_ENV)
-    run("train", env, "--imports", "own_env", "--steps", 40, "--evaluations", 1, "--folder", "run")
+    (folder / "commands_env.py").write_text(OWN_ENV)
+    run("train", env, "--imports", "commands_env", "--steps", 40, "--evaluations", 1, "--folder", "run")
     assert "mean and deviation" in run("evaluate", "run")
     trained = SACAux.load("run/model.zip", gym.make(env))
     assert trained.policy_class is SACAux.policy_aliases[policy]
