@@ -67,7 +67,7 @@ class Parts(Image):
     observation_space = gym.spaces.Dict(image=Image.observation_space, speed=gym.spaces.Box(-1, 1, (2,), np.float64))
 
 
-gym.register("Own-v0", Own, max_episode_steps=20)
+gym.register("Shown-v0", Own, max_episode_steps=20)
 gym.register("Unseen-v0", Unseen, max_episode_steps=20)
 gym.register("Image-v0", Image, max_episode_steps=20)
 gym.register("Parts-v0", Parts, max_episode_steps=20)
@@ -241,9 +241,9 @@ def test_the_version() -> None:
 @pytest.fixture
 def trained(folder: Path) -> Path:
     """A run of 400 steps whose model was kept, with running statistics."""
-    (folder / "commands_env.py").write_text(OWN_ENV)
+    (folder / "own_env.py").write_text(OWN_ENV)
     settings = {**HYPERPARAMETERS, "normalize": True}
-    own = tiny_run(environment="Own-v0", imports=("commands_env",), keep_model=True, checkpoints=(100,), hyperparameters=settings)
+    own = tiny_run(environment="Shown-v0", imports=("own_env",), keep_model=True, checkpoints=(100,), hyperparameters=settings)
     prepare_run(Path("trained"), own)
     train(Path("trained"))
     return Path("trained")
@@ -256,7 +256,7 @@ def test_a_model_is_evaluated_as_in_its_run(trained: Path) -> None:
     # The sum of the actions, not of normalized rewards.
     (point,) = read_curve(trained / "curve.csv")
     assert data["mean"] == pytest.approx(point.mean, abs=4)
-    shown = run("evaluate", trained / "model.zip", "Own-v0", "--episodes", 3, "--seed", 5)
+    shown = run("evaluate", trained / "model.zip", "Shown-v0", "--episodes", 3, "--seed", 5)
     assert shown.startswith(f"{data['mean']:.1f} ± {data['std']:.1f}")
 
 
@@ -274,12 +274,12 @@ def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
     assert "spaces do not match" in run("evaluate", "alone.zip", "Pendulum-v1", code=2)
     assert "Unseen-v0 cannot be made" in run("video", "alone.zip", "Unseen-v0", code=2)
     assert "Blind-v0 has no pictures" in run("video", "alone.zip", "Blind-v0", code=2)
-    assert "no_env cannot be imported" in run("evaluate", "alone.zip", "Own-v0", "--imports", "no_env", code=2)
+    assert "no_env cannot be imported" in run("evaluate", "alone.zip", "Shown-v0", "--imports", "no_env", code=2)
     assert "model.zip does not exist" in run("video", trained, code=2)
 
 
 def test_training_on_an_environment_of_ones_own(folder: Path) -> None:
-    (folder / "imported_env.py").write_text(OWN_ENV.replace("Own-v0", "Imported-v0"))
+    (folder / "imported_env.py").write_text(OWN_ENV.replace("Shown-v0", "Imported-v0"))
     arguments = ["train", "Imported-v0", "--steps", 300, "--evaluations", 1, "--episodes", 1, "--folder", "run"]
     assert "unknown environment 'Imported-v0'" in run(*arguments, code=2)
     (folder / "study.db").touch()
@@ -289,11 +289,11 @@ def test_training_on_an_environment_of_ones_own(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("env", "policy"), [("Own-v0", "MlpPolicy"), ("Image-v0", "CnnPolicy"), ("Parts-v0", "MultiInputPolicy")]
+    ("env", "policy"), [("Shown-v0", "MlpPolicy"), ("Image-v0", "CnnPolicy"), ("Parts-v0", "MultiInputPolicy")]
 )
 def test_observations_are_trained_on_as_they_are(env: str, policy: str, folder: Path) -> None:
-    (folder / "commands_env.py").write_text(OWN_ENV)
-    run("train", env, "--imports", "commands_env", "--steps", 40, "--evaluations", 1, "--folder", "run")
+    (folder / "own_env.py").write_text(OWN_ENV)
+    run("train", env, "--imports", "own_env", "--steps", 40, "--evaluations", 1, "--folder", "run")
     assert "mean and deviation" in run("evaluate", "run")
     trained = SACAux.load("run/model.zip", gym.make(env))
     assert trained.policy_class is SACAux.policy_aliases[policy]
