@@ -103,7 +103,8 @@ def resolve(value: "AuxLoss | str | Path | Mapping[str, Any]") -> AuxLoss:
         try:
             return resolve(yaml.safe_load(Path(value).read_text(encoding="utf-8")))
         except (OSError, ValueError, yaml.YAMLError) as error:
-            raise ValueError(f"{value}: {error}") from None
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise ValueError(f"{value}: {reason}") from None
     if isinstance(value, Mapping):
         return resolve(value["aux_loss"]) if value.keys() == {"aux_loss"} else AuxLoss.from_dict(value)
     if not isinstance(value, str):

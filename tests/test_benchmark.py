@@ -97,7 +97,7 @@ def test_evaluations_in_between_are_no_checkpoints() -> None:
         ("mine.yml other/mine.yml", {}, "two files are called mine"),
         ("mine.yml missing.yml", {}, "missing.yml: cannot be read: No such file"),
         ("mine.yml default.yml", {}, "no entry of one environment in common: name environments"),
-        ("mine.yml", {"environments": ["Pendulm-v1"]}, "unknown environment 'Pendulm-v1': .*nearest: Pendulum-v1"),
+        ("mine.yml", {"environments": ["Pendulm-v1"]}, "unknown environment 'Pendulm-v1'.*nearest: Pendulum-v1"),
         ("mine.yml", {"environments": ["Hopper-v5"]}, "mine.yml: neither 'Hopper-v5' nor 'default' is there"),
         ("default.yml", {"environments": ["CartPole-v1"]}, "CartPole-v1 cannot be trained .*Discrete"),
         ("mine.yml", {"checkpoints": []}, f"n_timesteps ends the runs on {ENV} at 400 environment steps: name checkpoints"),

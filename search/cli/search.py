@@ -58,7 +58,7 @@ def search(
 
     from search.execution.driver import Driver
     from search.execution.runs import LocalExecutor
-    from search.execution.storage import open_storage
+    from search.execution.storage import STUDY_FILE, open_storage
     from search.results.dashboard import update_plots
     from search.results.report import stored_baselines
     from search.studies.search import open_search, runs_of
@@ -67,10 +67,12 @@ def search(
     logging.set_verbosity(logging.WARNING)
     settings = read_config(config, threads=threads, generations=generations, pruner=pruner)
     at_once = workers or (settings.population_size * len(settings.seeds) if executor == "ray" else 1)
+    path = run_folder(config, folder)
     if dry_run:
         show_costs(planned(settings), at_once)
+        if (path / STUDY_FILE).exists():
+            say(f"This counts all that the file says, also what is done: aarl status {path}")
         return
-    path = run_folder(config, folder)
     opened = open_storage(path, storage)
     others = {name for name in get_all_study_names(opened) if name != settings.name} if storage is None else ()
     if others:

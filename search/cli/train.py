@@ -46,7 +46,7 @@ def train(
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.callbacks import aulc
     from search.studies.single import prepare_one
-    from search.training.run import read_run
+    from search.training.run import is_finished, read_run
     from search.training.run import train as train_run
 
     started = time.monotonic()
@@ -62,8 +62,11 @@ def train(
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
     path = prepare_one(env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, modules(imports))
-    planned = ", ".join(f"{point:,}" for point in read_run(path).checkpoints)
-    errors.print(f"Into {path}; evaluations, from which it can be resumed, at {planned} environment steps")
+    if is_finished(path):
+        errors.print(f"{path} is finished: this is its result")
+    else:
+        planned = ", ".join(f"{point:,}" for point in read_run(path).checkpoints)
+        errors.print(f"Into {path}; evaluations, from which it can be resumed, at {planned} environment steps")
     curve = train_run(path, bar, on_evaluation)
     if json:
         say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})
@@ -150,7 +153,7 @@ def evaluate(
     if json:
         say_json({"mean": float(np.mean(returns)), "std": float(np.std(returns)), "returns": returns})
     else:
-        say(f"{np.mean(returns):.1f} ± {np.std(returns):.1f}, mean and deviation of {episodes} episodes")
+        say(f"{np.mean(returns):.1f} ± {np.std(returns):.1f}, mean and deviation over episodes: {episodes}")
 
 
 @app.command(rich_help_panel="One agent")

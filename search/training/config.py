@@ -158,12 +158,11 @@ def resolve_env_id(name: str) -> str:
     if full in env_ids():
         return full
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
-    nearest = difflib.get_close_matches(name, known)
-    hint = "" if env_ids() or "-v" in name else f" {NEEDS_DMC}"
-    raise ConfigError(
-        f"unknown environment {name!r}: a module of yours that registers it belongs to the imports (--imports, or imports: in "
-        f"the file).{hint}{' The nearest: ' + ', '.join(nearest) if nearest else ''}"
-    )
+    nearest = ", ".join(difflib.get_close_matches(name, known))
+    hints = [f"The nearest: {nearest}."] if nearest else []
+    hints += [] if env_ids() or "-v" in name else [f"{NEEDS_DMC}."]
+    hints += ["A module of yours that registers it belongs to the imports (--imports, or imports: in the file)"]
+    raise ConfigError(f"unknown environment {name!r}. {' '.join(hints)}")
 
 
 def import_modules(names: Sequence[str]) -> Sequence[str]:
