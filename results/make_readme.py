@@ -1,10 +1,11 @@
 """
 Write README.md from the runs that lie beside it: every number of a run of ours comes from a curve.csv and its provenance.json.
 
-A folder here is that of an ``aarl benchmark``, without the checkpoints of unfinished runs. Its text is its about.md, the first
-line being its title; numbers do not belong there.
+A folder here is that of an ``aarl benchmark`` or an ``aarl search``, without the checkpoints of unfinished runs. Its text is
+its about.md, the first line being its title; numbers do not belong there.
 """
 
+import math
 import os
 import shlex
 import statistics
@@ -14,9 +15,16 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from scipy.stats import mannwhitneyu
+
 from sb3_aarl.callbacks import read_curve
+from search.execution.matrix import stored_scores
+from search.execution.storage import STUDY_FILE, load_study, open_storage
+from search.results.analysis import analysed, trial_table
 from search.results.table import closest_table, paper_scores
 from search.studies.benchmark import read_abouts, task_name
+from search.studies.cross_validation import ranking
+from search.studies.search import SETTINGS_KEY
 
 RESULTS = Path(__file__).parent
 ABOUT = "about.md"
@@ -28,6 +36,9 @@ CANDIDATES, STEPS, PAPER_HOURS = 725, 500_000, 1_500
 REFERENCE = {("dm_control/cheetah-run-v0", 100_000): "AARL-State 436, SAC with DenseMLP 274 (seed 1, float32)"}
 # The paper's scores from pixels and from states.
 TABLES = {"CnnPolicy": 3, "MlpPolicy": 4}
+# What a search does to losses; the others are drawn at random, from priors, or given.
+EVOLVED = ("crossover", "replacement", "horizon_change")
+DRAWN, BEST = 20, 10
 
 INTRODUCTION = f"""# Results
 
@@ -44,13 +55,17 @@ def readme(results: Path) -> str:
 
     :param results: Folder with benchmarks' folders in it
     """
-    sections = [line for folder in folders(results) for line in section(folder, results)]
+    sections = [
+        line
+        for folder in folders(results)
+        for line in (search_section if (folder / STUDY_FILE).exists() else section)(folder, results)
+    ]
     return "\n".join([INTRODUCTION, *(sections or ["No run is finished yet."])]).strip() + "\n"
 
 
 def folders(results: Path) -> list[Path]:
     """
-    Folders of benchmarks, in alphabetical order.
+    Folders of benchmarks and searches, in alphabetical order.
 
     :param results: Folder they are in
     """
@@ -68,10 +83,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
     name = folder.relative_to(results.parent).as_posix()
     yield f"## {title}\n"
     yield text.strip() + "\n"
-    yield f"`aarl table {name}`:\n"
-    yield "```text"
-    yield printed_table(folder)
-    yield "```\n"
+    yield from printed(f"aarl table {name}")
     abouts = read_abouts(folder)
     yield from paper(abouts.values())
     finished = [(path, about) for path, about in abouts.items() if "seconds" in about]
@@ -98,18 +110,87 @@ def section(folder: Path, results: Path) -> Iterator[str]:
     yield from cost([about for _, about in finished if "program" not in about])
 
 
-def printed_table(folder: Path) -> str:
+def search_section(folder: Path, results: Path) -> Iterator[str]:
     """
-    The output of ``aarl table``.
+    The section of a search: its text, what its generations found, its best losses, all that ``aarl analyze`` says, and its
+    matrices.
 
-    :param folder: Folder of a benchmark
+    :param folder: Folder of the search
+    :param results: Folder it is in
     """
-    program = [sys.executable, "-m", "search.cli.main", "table", str(folder)]
+    title, _, text = (folder / ABOUT).read_text(encoding="utf-8").partition("\n")
+    name = folder.relative_to(results.parent).as_posix()
+    yield f"## {title}\n"
+    yield text.strip() + "\n"
+    study = load_study(open_storage(folder, create=False))
+    if len(study.user_attrs[SETTINGS_KEY]["seeds"]) > 1:
+        yield from printed(f"python benchmarks/fidelity.py {name}")
+        return
+    trials = analysed(trial_table(study.get_trials(deepcopy=False)))
+    evolved, random = trials[trials["operation"].isin(EVOLVED)], trials[trials["operation"] == "random"]
+    yield "Scores: mean ± its standard error (number, best).\n"
+    yield "| generation | all | evolved | random |"
+    yield "|---|---|---|---|"
+    for generation in [*sorted(trials["generation"].unique()), "all"]:
+        parts = [part if generation == "all" else part[part["generation"] == generation] for part in (trials, evolved, random)]
+        yield f"| {generation} | {' | '.join(summary(part['score'].tolist()) for part in parts)} |"
+    scores, others = evolved["score"].tolist(), random["score"].tolist()
+    if min(len(scores), len(others)) >= DRAWN:
+        best = [f"{mean_of_best(values, DRAWN):.0f}" for values in (scores, others)]
+        p = mannwhitneyu(scores, others).pvalue
+        yield f"\nOf {DRAWN} drawn from the evolved the best is {best[0]} on average, of {DRAWN} random ones {best[1]};"
+        yield f"Mann-Whitney's p of all is {p:.1g}.\n"
+    yield "| trial | generation | operation | score | loss |"
+    yield "|---|---|---|---|---|"
+    for row in trials.nlargest(BEST, "score").to_dict("records"):
+        yield f"| {row['number']} | {row['generation']} | {row['operation']} | {row['score']:.0f} | `{row['loss']}` |"
+    yield ""
+    yield from printed(f"aarl analyze {name}")
+    for part, scores_of in ((part, stored_scores(folder / part)) for part in ("baselines", "cross-validation")):
+        if not scores_of.empty:
+            yield f"{part.capitalize()}, AULC:\n"
+            yield "```text"
+            yield ranking(scores_of).round(1).to_string()
+            yield "```\n"
+
+
+def summary(scores: list[float]) -> str:
+    """
+    Mean, standard error, number and best of scores.
+
+    :param scores: Scores, any number of them
+    """
+    if len(scores) < 2:
+        return ", ".join(f"{score:.0f}" for score in scores)
+    error = statistics.stdev(scores) / math.sqrt(len(scores))
+    return f"{statistics.mean(scores):.0f} ± {error:.0f} ({len(scores)}, {max(scores):.0f})"
+
+
+def mean_of_best(scores: list[float], n: int) -> float:
+    """
+    The expectation of the best of n scores that are drawn without replacement.
+
+    :param scores: At least n scores
+    :param n: How many are drawn
+    """
+    ways = (math.comb(rank, n - 1) for rank in range(len(scores)))
+    return sum(score * way for score, way in zip(sorted(scores), ways, strict=True)) / math.comb(len(scores), n)
+
+
+def printed(command: str) -> Iterator[str]:
+    """
+    A command and what it prints.
+
+    :param command: ``aarl ...`` or ``python ...``, run beside results/
+    """
+    name, *arguments = command.split()
+    program = [sys.executable, *(["-m", "search.cli.main"] if name == "aarl" else []), *arguments]
     environment = {**os.environ, "COLUMNS": "120", "NO_COLOR": "1"}
-    printed = subprocess.run(
-        program, env=environment, cwd=RESULTS.parent, text=True, stdout=subprocess.PIPE, check=True
-    ).stdout
-    return "\n".join(line.rstrip() for line in printed.strip().splitlines())
+    text = subprocess.run(program, env=environment, cwd=RESULTS.parent, text=True, stdout=subprocess.PIPE, check=True).stdout
+    yield f"`{command}`:\n"
+    yield "```text"
+    yield "\n".join(line.rstrip() for line in text.strip().splitlines())
+    yield "```\n"
 
 
 def paper(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """Both README.md agree with the runs in results/, and each run can be repeated with the command printed there."""
 
 import inspect
+import itertools
 import json
 import math
 import re
@@ -12,12 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scipy.stats import mannwhitneyu
 from typer.testing import CliRunner
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from search.cli.main import app
 from search.execution.matrix import cell_folder
+from search.execution.storage import load_study, open_storage
+from search.results.analysis import analysed, trial_table
 from search.results.statistics import interquartile_means
 from search.results.table import paper_scores, read_runs
 from search.studies import benchmark
@@ -122,6 +126,24 @@ def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             kept = {key: value for key, value in about.items() if key not in ("seconds", "sessions")}
             assert "program" in about or any(other.items() <= kept.items() for other in repeated)
             assert [point.environment_steps for point in read_curve(path / "curve.csv")] == about["evaluations"]
+
+
+def test_mean_of_the_best_of_some_scores() -> None:
+    scores = [3.0, 1.0, 4.0, 1.0, 5.0, 9.0]
+    best = [max(drawn) for drawn in itertools.combinations(scores, 3)]
+    assert make_readme["mean_of_best"](scores, 3) == pytest.approx(statistics.mean(best))
+
+
+def test_a_search_found_what_its_text_says() -> None:
+    """results/search/cheetah_run_simba/about.md is right about its study."""
+    study = load_study(open_storage(RESULTS / "search" / "cheetah_run_simba", create=False))
+    trials = analysed(trial_table(study.get_trials(deepcopy=False)))
+    evolved = trials[trials["operation"].isin(make_readme["EVOLVED"])]["score"]
+    random, given = (trials[trials["operation"] == operation]["score"] for operation in ("random", "given"))
+    assert mannwhitneyu(evolved, random, alternative="greater").pvalue < 1e-6
+    assert evolved.mean() < given.mean() and evolved.max() < given.max()
+    first, second, *later = trials.groupby("generation")["score"].mean()
+    assert first < second and max(later) < second + 5
 
 
 def last_returns(variant: str, task: str = "cheetah-run", folder: str = "choices_small") -> list[float]:
