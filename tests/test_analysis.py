@@ -17,7 +17,7 @@ from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from sb3_aarl.catalog import published
 from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
-from search.results import analysis, rankings
+from search.results import analysis
 
 # Section 3.3, typed in again.
 PATTERNS = {
@@ -306,14 +306,14 @@ def test_rankings_under_three_metrics():
         make_trial(loss, 1e6, state=TrialState.PRUNED, curve=[[1000, 1e6, 0.0]]),
         make_trial(loss, state=TrialState.FAIL),
     ]
-    ranking = rankings.rankings(analysis.analysed(analysis.trial_table(in_study([*trials, *others]))))
+    ranking = analysis.rankings(analysis.analysed(analysis.trial_table(in_study([*trials, *others]))))
     metrics = {"aulc": curves.mean(axis=1), "first": curves[:, 0], "last": curves[:, -1]}
     by_number = ranking.sort_values("number")
     assert by_number["number"].tolist() == list(range(40)) and ranking["rank_aulc"].is_monotonic_increasing
     for name, values in metrics.items():
         np.testing.assert_allclose(by_number[name], values)
         assert by_number[f"rank_{name}"].tolist() == [1 + int((values > value).sum()) for value in values]
-    agreement = rankings.rank_agreement(ranking, top=7)
+    agreement = analysis.rank_agreement(ranking, top=7)
     assert list(agreement.index) == list(combinations(metrics, 2))
     for (one, other), row in agreement.iterrows():
         for test, name in ((scipy.stats.spearmanr, "spearman"), (scipy.stats.kendalltau, "kendall")):
@@ -326,4 +326,4 @@ def test_curves_with_other_checkpoints_are_named():
     loss = AuxLoss.parse("{s_t} -> {s_t+1}")
     trials = in_study([make_trial(loss, 1.0, curve=[[steps, 1.0, 0.0]]) for steps in (1000, 1000, 2000)])
     with pytest.raises(ValueError, match="at different environment steps"):
-        rankings.rankings(analysis.trial_table(trials))
+        analysis.rankings(analysis.trial_table(trials))

@@ -63,7 +63,7 @@ def search_in_miniature(storage):
             trial.set_user_attr("reason", EVIL)
         dashboard.annotate_trial(trial)
         study.tell(trial, *([None, TrialState.FAIL] if trial.number == 2 else [score]))
-    dashboard.annotate_study(study)
+    optuna_dashboard.save_note(study, dashboard.HOW_TO_READ)
     dashboard.update_plots(study, BASELINES)
     return study
 

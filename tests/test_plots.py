@@ -18,6 +18,7 @@ from optuna.trial import TrialState, create_trial
 from sb3_aarl.aux_loss import AuxLoss
 from search.evolution.space import distributions, loss_of, loss_to_params, random_loss
 from search.results import analysis
+from search.results.analysis import lineage, ranked
 from search.results.plots import (
     evolution_figure,
     evolution_plot,
@@ -26,7 +27,6 @@ from search.results.plots import (
     patterns_plot,
     rankings_plot,
 )
-from search.results.trials import lineage, ranked
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 BASELINES = [("SAC", 12.5), ("<b>CURL</b>", -3.0)]

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from search.cli import figures, matrices, results, search, train
+from search.cli import matrices, results, search, train
 from search.cli.console import errors
 
 # Training alone does without these modules; the extra that has them.
@@ -63,7 +63,7 @@ def explain(error: Exception) -> str | None:
 
 
 app = typer.Typer(cls=Program, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-for group in (train, search, matrices, results, figures):
+for group in (train, search, matrices, results):
     app.add_typer(group.app)
 
 

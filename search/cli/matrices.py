@@ -6,21 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from search.cli import options
 from search.cli.console import errors, live, records, say, say_json, show_costs, show_table, time_to_go
-from search.cli.options import (
-    SHIPPED,
-    DryRun,
-    Folder,
-    Imports,
-    Json,
-    SearchFile,
-    Storage,
-    Threads,
-    Workers,
-    modules,
-    read_config,
-    run_folder,
-)
+from search.cli.options import Folder, Json, SearchFile, Storage, Threads, Workers, modules, read_config, run_folder
 from search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -165,7 +153,7 @@ def benchmark(
         list[Path],
         typer.Argument(
             callback=lambda paths: [find_file(path) for path in paths],
-            help=f"Hyper-parameters, one for each variant: {SHIPPED}, such as aarl_state.",
+            help=f"Hyper-parameters, one for each variant: {options.SHIPPED}, such as aarl_state.",
         ),
     ],
     envs: Annotated[
@@ -189,13 +177,13 @@ def benchmark(
     threads: Annotated[int, typer.Option(help="Threads of each run.", min=1)] = 1,
     folder: Annotated[
         Path, typer.Option(help="Folder of the benchmark; more variants, tasks and seeds may be added to it.")
-    ] = Path("runs/benchmark"),
-    imports: Imports = "",
-    dry_run: DryRun = False,
+    ] = options.BENCHMARK,
+    imports: options.Imports = "",
+    dry_run: options.DryRun = False,
     json: Json = False,
 ) -> None:
     """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command resumes it."""
-    from search.cli.results import show_benchmark
+    from search.cli.results import table
     from search.studies.benchmark import load_benchmark, parse_seeds, parse_steps
 
     names = [name.strip() for name in envs.split(",")] if envs else []
@@ -208,5 +196,5 @@ def benchmark(
         show_costs(unfinished(matrix), workers)
         return
     train_matrix(matrix, workers)
-    show_benchmark(folder, json)
+    table(folder, json)
     exit_if_failed(matrix)

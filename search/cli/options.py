@@ -20,6 +20,7 @@ SearchFile = Annotated[
         help="Configuration of a search: a file, or one of `aarl configs` by name, such as demo.",
     ),
 ]
+BENCHMARK = Path("runs/benchmark")
 SHIPPED = "a file, or one of `aarl configs` by name"
 Imports = Annotated[str, Option(help="Modules of yours that register environments, such as my_env,other.")]
 DryRun = Annotated[

@@ -120,10 +120,12 @@ def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
 
 def annotations(study: "Study", folder: Path) -> "Callable[[Trial], None]":
     """Write the note of a study; the function that is returned keeps the notes of its trials and its plot up to date."""
-    from search.results.dashboard import annotate_study, annotate_trial, update_plots
+    from optuna_dashboard import save_note
+
+    from search.results.dashboard import HOW_TO_READ, annotate_trial, update_plots
     from search.results.report import stored_baselines
 
-    annotate_study(study)
+    save_note(study, HOW_TO_READ)
     drawn = -PLOT_SECONDS
 
     def annotate(trial: "Trial") -> None:

@@ -1,7 +1,6 @@
 """Commands for one run: train with a loss, list the losses that have a name; evaluate and film what was trained."""
 
 import itertools
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -49,14 +48,9 @@ def train(
     from search.training.run import is_finished, read_run
     from search.training.run import train as train_run
 
-    started = time.monotonic()
-
     def show(curve: "list[Evaluation]") -> None:
-        # A resumed run has evaluations of before; they are as far apart as those that follow.
-        nonlocal started
-        now = time.monotonic()
-        left, started = (evaluations - len(curve)) * (now - started), now
         point = curve[-1]
+        left = (evaluations - len(curve)) * point.seconds / len(curve)
         errors.print(f"{point.environment_steps:,} environment steps: {point.mean:.1f} ± {point.std:.1f}, {time_to_go(left)}")
 
     # A job's log has no place for a bar.

@@ -1,13 +1,15 @@
-"""What a search teaches about auxiliary losses (paper, section 3.3, B.2, B.3): pure functions of a table of trials."""
+"""What a search teaches about auxiliary losses (paper, section 3.3, B.2, B.3): functions of trials or of a table of them."""
 
+import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial
+from optuna.trial import FrozenTrial, TrialState
 from scipy.spatial.distance import pdist
 from scipy.stats import ttest_ind
 from sklearn.ensemble import RandomForestRegressor
@@ -15,8 +17,6 @@ from sklearn.ensemble import RandomForestRegressor
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 from search.evolution.space import loss_of, loss_to_params
-from search.results.rankings import rank_agreement, rankings
-from search.results.trials import lineage, ranked, score_of
 
 # Section 3.3, in the order of table 5.
 PATTERNS: Mapping[str, str | AuxLoss] = {
@@ -40,6 +40,32 @@ COLUMNS: dict[str, Any] = {
     **{"number": int, "state": str, "generation": int, "operation": str, "parents": object, "score": float},
     **{"loss": object, "canonical": object, "horizon": "Int64", "operator": object, "negatives": "boolean", "curve": object},
 }
+
+# Of a learning curve: the mean of all evaluations, the first, the last (paper, B.2, figure 10).
+METRICS = ("aulc", "first", "last")
+
+
+def score_of(trial: FrozenTrial) -> float | None:
+    """The score of a completed trial; None for all others, and where it is not finite."""
+    finished = trial.state == TrialState.COMPLETE and trial.value is not None and math.isfinite(trial.value)
+    return trial.value if finished else None
+
+
+def ranked(trials: Iterable[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> list[FrozenTrial]:
+    """The trials that have a score, the best first."""
+    sign = -1 if direction == StudyDirection.MAXIMIZE else 1
+    scores = [(score, trial) for trial in trials if (score := score_of(trial)) is not None]
+    return [trial for _, trial in sorted(scores, key=lambda scored: (sign * scored[0], scored[1].number))]
+
+
+def lineage(trial: FrozenTrial, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+    """All ancestors of a trial, the latest first."""
+    line, wanted = [], set(trial.user_attrs.get("parents", ()))
+    for earlier in reversed(trials[: trial.number]):
+        if earlier.number in wanted:
+            line.append(earlier)
+            wanted |= set(earlier.user_attrs.get("parents", ()))
+    return line
 
 
 def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
@@ -216,6 +242,46 @@ def diversity(table: pd.DataFrame) -> pd.DataFrame:
         rows[generation] = {"n": len(losses), "distinct": losses.nunique() / len(losses), "hamming": hamming}
     result = pd.DataFrame.from_dict(rows, orient="index", columns=["n", "distinct", "hamming"])
     return result.astype({"n": int}).rename_axis("generation")
+
+
+def rankings(table: pd.DataFrame) -> pd.DataFrame:
+    """
+    The trials of :func:`analysed` that have a curve, in the order of AULC, with their ranks by AULC and by their mean
+    returns at the first and the last checkpoint.
+    """
+    trials = table[table["curve"].map(len) > 0]
+    if trials.empty:
+        raise ValueError("no complete trial has a learning curve")
+    if trials["curve"].map(lambda curve: tuple(point[0] for point in curve)).nunique() > 1:
+        raise ValueError("trials were evaluated at different environment steps: their learning curves cannot be compared")
+    result = trials[["number", "loss", "curve"]].copy()
+    returns = trials["curve"].map(lambda curve: [mean for _, mean, _ in curve])
+    result["aulc"] = returns.map(np.mean).astype(float)
+    result["first"], result["last"] = returns.str[0].astype(float), returns.str[-1].astype(float)
+    for name in METRICS:
+        result[f"rank_{name}"] = result[name].rank(ascending=False, method="min").astype(int)
+    return result.sort_values(["rank_aulc", "number"]).reset_index(drop=True)
+
+
+def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
+    """
+    How far the three metrics agree on which losses are good: one row a pair of metrics with ``spearman`` and ``kendall`` (rank
+    correlations over all trials), and ``shared``: how many trials are among the best ``top`` under both.
+    """
+    rows = {}
+    for pair in combinations(METRICS, 2):
+        first, second = (ranking[metric] for metric in pair)
+        leaders = [set(leading(ranking, metric, top)["number"]) for metric in pair]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # too few trials, or all alike: NaN
+            correlations = {method: first.corr(second, method=method) for method in ("spearman", "kendall")}
+        rows[pair] = {**correlations, "shared": len(leaders[0] & leaders[1])}
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def leading(ranking: pd.DataFrame, metric: str, top: int = 10) -> pd.DataFrame:
+    """The best trials under a metric (``aulc``, ``first`` or ``last``); of equals the ones with lower numbers."""
+    return ranking.sort_values([f"rank_{metric}", "number"]).head(top)
 
 
 def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:

@@ -23,11 +23,6 @@ experience which others are predicted. Its value is the area under its learning 
 so that their importances are the tokens'."""
 
 
-def annotate_study(study: Study) -> None:
-    """Write the study's note: what it is, and how to read it."""
-    save_note(study, HOW_TO_READ)
-
-
 def annotate_trial(trial: Trial) -> None:
     """Write or replace the note of a running trial: its loss, where it comes from, and why it failed."""
     attributes = trial.user_attrs

@@ -18,7 +18,6 @@ from optuna.study import StudyDirection
 
 from sb3_aarl.aux_loss import AuxLoss
 from search.results import analysis
-from search.results.rankings import leading, rank_agreement, rankings
 
 # Lines differ by dash, not by colour alone: they have to be told apart in grey.
 DASHES = ("dash", "dot", "dashdot", "longdash", "longdashdot")
@@ -169,18 +168,18 @@ def patterns_plot(
 
 def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
     """Learning curves of the best candidates under three metrics (AULC, first and last checkpoint): the paper's figure 10."""
-    ranking = rankings(analysis.analysed(table))
-    agreement = rank_agreement(ranking, top)
+    ranking = analysis.rankings(analysis.analysed(table))
+    agreement = analysis.rank_agreement(ranking, top)
     steps = [point[0] for point in ranking["curve"].iloc[0]]
     first, last = (EngFormatter(sep="")(step) for step in (steps[0], steps[-1]))
     names = {"aulc": "AULC", "first": f"the return at {first} steps", "last": f"the return at {last} steps"}
     figure, panels = _panels(list(names.values()), "Mean return", columns=3, width=4.2, height=3.6)
-    by_aulc = set(leading(ranking, "aulc", top)["number"])
+    by_aulc = set(analysis.leading(ranking, "aulc", top)["number"])
     looks = {True: ("-", "#8c8c8c", f"in the top {top} by AULC"), False: (":", "black", "not in it")}
     for axes in panels[1:]:
         axes.sharey(panels[0])
     for axes, (metric, name) in zip(panels, names.items(), strict=True):
-        best = leading(ranking, metric, top)
+        best = analysis.leading(ranking, metric, top)
         means = np.array([[mean for _, mean, _ in curve] for curve in best["curve"]])
         for number, curve in zip(best["number"], means, strict=True):
             line, colour, label = looks[number in by_aulc]

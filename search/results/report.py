@@ -18,13 +18,11 @@ from sb3_aarl.callbacks import replace_text
 from search.execution.matrix import comparable, stored_scores, task_name
 from search.results import analysis
 from search.results.plots import evolution_plot, patterns_plot, rankings_plot
-from search.results.trials import lineage, ranked
 from search.studies import cross_validation
 from search.studies.search import SETTINGS_KEY
 from search.training.provenance import provenance
 
 N_BEST = 10
-N_IMPORTANCES = 12
 
 
 def stored_baselines(folder: Path) -> list[tuple[str, float]]:
@@ -51,9 +49,10 @@ def write_report(
     """Write the report of a study, finished or not, with baselines and the runs of its cross-validation as one HTML file."""
     trials = study.get_trials(deepcopy=False)
     table = analysis.trial_table(trials)
-    best = ranked(trials, study.direction)
+    best = analysis.ranked(trials, study.direction)
     title, baselines = study.study_name, list(baselines)
-    machines = analysis.machines(trials)
+    summary = analysis.summary(trials, study.direction)
+    n_analysed = len(analysis.analysed(table))
     started = [f"{trial.datetime_start:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_start]
     ended = [f"{trial.datetime_complete:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_complete]
     environment = jinja2.Environment(
@@ -63,16 +62,19 @@ def write_report(
         study=study,
         settings=study.user_attrs.get(SETTINGS_KEY, {}),
         counts=Counter(table["state"]),
-        hours=machines["hours"].sum(),
+        hours=summary.tables["machines"]["hours"].sum(),
         generations=analysis.readable("generations", generation_table(table)),
         baselines=baselines,
         evolution=_picture(evolution_plot({title: table}, {title: baselines}, study.direction)) if best else None,
         best=_candidates(best[:N_BEST]),
         winner=_candidates(best[:1]).to_dict("records"),
-        lineage=_candidates(lineage(best[0], trials)) if best else None,
+        lineage=_candidates(analysis.lineage(best[0], trials)) if best else None,
         validation=_validation(validation),
-        taught=_taught(study, table),
-        machines=analysis.readable("machines", machines),
+        n_analysed=n_analysed,
+        tables={name: analysis.readable(name, frame) for name, frame in summary.tables.items()},
+        problems=summary.problems,
+        patterns=_picture(patterns_plot({title: table})) if n_analysed else None,
+        rankings=None if "rank_agreement" in summary.problems else _picture(rankings_plot(table)),
         started=min(started, default=""),
         ended=max(ended, default=""),
         versions=Counter(trial.user_attrs["versions"] for trial in trials if "versions" in trial.user_attrs),
@@ -99,24 +101,6 @@ def _validation(runs: pd.DataFrame | None) -> dict[str, Any] | None:
     losses = [Markup("<code>{}</code>").format(name) if "->" in name else f"Baseline: {name}" for name in ranking.index]
     text.insert(0, "Loss", losses)
     return {"ranking": text, "left_out": runs["variant"].nunique() - len(ranking)}
-
-
-def _taught(study: Study, table: pd.DataFrame) -> dict[str, Any] | None:
-    """Tables and figures of what the trials teach about losses, None if there is nothing to compare."""
-    n_analysed = len(analysis.analysed(table))
-    if not n_analysed:
-        return None
-    summary = analysis.summary(study.get_trials(deepcopy=False), study.direction)
-    texts = {name: analysis.readable(name, frame) for name, frame in summary.tables.items()}
-    if "importances" in texts:
-        texts["importances"] = texts["importances"].head(N_IMPORTANCES)
-    return {
-        "n": n_analysed,
-        "tables": texts,
-        "problems": summary.problems,
-        "patterns": _picture(patterns_plot({study.study_name: table})),
-        "rankings": None if "rank_agreement" in summary.problems else _picture(rankings_plot(table)),
-    }
 
 
 def _picture(figure: Figure) -> str:

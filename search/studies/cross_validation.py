@@ -16,7 +16,7 @@ from sb3_aarl.callbacks import replace_text
 from search.evolution.space import loss_of
 from search.evolution.surrogate import TokenModel
 from search.execution.matrix import Cell, Matrix
-from search.results.trials import ranked
+from search.results.analysis import ranked
 from search.studies.config import Baseline, CrossValidation, SearchConfig
 from search.studies.search import make_run
 from search.training.config import ConfigError

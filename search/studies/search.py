@@ -48,11 +48,7 @@ def make_run(
 def runs_of(config: SearchConfig) -> Callable[[AuxLoss], list[Run]]:
     """What is trained for a candidate: a function from a loss to its runs, one for each training seed."""
     template = make_run(config, config.environment, None, config.seeds[0])
-
-    def make_runs(aux_loss: AuxLoss) -> list[Run]:
-        return [template.model_copy(update={"aux_loss": str(aux_loss), "seed": seed}) for seed in config.seeds]
-
-    return make_runs
+    return lambda loss: [template.model_copy(update={"aux_loss": str(loss), "seed": seed}) for seed in config.seeds]
 
 
 def all_runs(config: SearchConfig) -> list[Run]:

@@ -10,13 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_aarl import SACAux, catalog
 from sb3_aarl.envs import PREFIX
-from search.training.config import (
-    ConfigError,
-    action_repeat,
-    import_modules,
-    load_hyperparameters,
-    resolve_env_id,
-)
+from search.training.config import ConfigError, action_repeat, import_modules, load_hyperparameters, resolve_env_id
 from search.training.run import (
     MODEL,
     NORMALIZE,
