@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
+from test_space import losses
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from sb3_aarl.catalog import published
 from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
 from search.results import analysis
@@ -46,16 +46,6 @@ def naive_class(loss, name):
         return PATTERNS[name][0] <= source and PATTERNS[name][1] <= target
     n_source, n_target = (sum(token[0] == COUNTS[name] for token in side) for side in (source, target))
     return None if n_source == n_target else n_target > n_source
-
-
-@st.composite
-def losses(draw, max_horizon=3):
-    horizon = draw(st.integers(1, max_horizon))
-    bits = st.lists(st.booleans(), min_size=3 * horizon + 1, max_size=3 * horizon + 1)
-    source = draw(bits.filter(lambda mask: any(mask[::3])))
-    return AuxLoss(
-        horizon, tuple(source), tuple(draw(bits.filter(any))), draw(st.sampled_from(OPERATORS)), draw(st.booleans())
-    )
 
 
 def make_trial(loss, value=None, state=TrialState.COMPLETE, operators=None, **attrs):
@@ -98,26 +88,10 @@ def planted():
     return analysis.trial_table(in_study([*trials[:300], *others, *trials[300:]])), candidates
 
 
-def test_paper_example_of_the_rule():
-    loss = AuxLoss.parse("{s_t, a_t} -> {s_t+1, s_t+2}")
-    assert analysis.has_pattern(loss, AuxLoss.parse("{s_t, a_t} -> {s_t+1}"))
-    assert not analysis.has_pattern(loss, AuxLoss.parse("{a_t, s_t+1} -> {s_t}"))
-    assert not analysis.has_pattern(AuxLoss.parse("{s_t+1, a_t+1} -> {s_t+2}"), AuxLoss.parse("{s_t, a_t} -> {s_t+1}"))
-
-
 @given(losses(), losses(max_horizon=2))
 def test_rule_is_that_of_sets(loss, pattern):
     (source, target), (pattern_source, pattern_target) = tokens(loss), tokens(pattern)
     assert analysis.has_pattern(loss, pattern) == (pattern_source <= source and pattern_target <= target)
-
-
-def test_published_losses_have_their_patterns():
-    trials = in_study([make_trial(candidate.loss, 1.0) for candidate in published()])
-    classes = analysis.table5_classes(analysis.trial_table(trials))
-    assert list(classes) == [*PATTERNS, *COUNTS]
-    for name in classes:
-        expected = [naive_class(candidate.loss, name) for candidate in published()]
-        assert [None if pd.isna(value) else bool(value) for value in classes[name]] == expected
 
 
 def test_table5_recovers_planted_effects_as_scipy_tests_them(planted):
@@ -320,10 +294,3 @@ def test_rankings_under_three_metrics():
             assert row[name] == pytest.approx(test(metrics[one], metrics[other]).statistic)
         tops = [set(np.argsort(-metrics[name], kind="stable")[:7]) for name in (one, other)]
         assert row["shared"] == len(tops[0] & tops[1])
-
-
-def test_curves_with_other_checkpoints_are_named():
-    loss = AuxLoss.parse("{s_t} -> {s_t+1}")
-    trials = in_study([make_trial(loss, 1.0, curve=[[steps, 1.0, 0.0]]) for steps in (1000, 1000, 2000)])
-    with pytest.raises(ValueError, match="at different environment steps"):
-        analysis.rankings(analysis.trial_table(trials))

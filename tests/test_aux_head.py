@@ -1,14 +1,13 @@
 """AuxHead against an oracle that walks over the tokens one by one."""
 
-import pytest
 import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_space import losses
 from torch import nn
 
 from sb3_aarl import AuxLoss
 from sb3_aarl.aux_head import AuxHead
-from sb3_aarl.aux_loss import OPERATORS
 from sb3_aarl.buffers import WindowSamples
 
 LATENT, ACTION, OBSERVATION = 3, 2, 4
@@ -87,16 +86,6 @@ def oracle(head: AuxHead, windows: WindowSamples, encoder: Encoder, target_encod
     return head.operator(hidden.clamp(min=0) @ last.weight.T + last.bias, target)
 
 
-@st.composite
-def losses(draw: st.DrawFn) -> AuxLoss:
-    horizon = draw(st.integers(1, 4))
-    bits = st.lists(st.booleans(), min_size=3 * horizon + 1, max_size=3 * horizon + 1)
-    source = draw(bits.filter(lambda mask: any(mask[::3])))
-    return AuxLoss(
-        horizon, tuple(source), tuple(draw(bits.filter(any))), draw(st.sampled_from(OPERATORS)), draw(st.booleans())
-    )
-
-
 @settings(deadline=None, max_examples=25)
 @given(losses(), st.sampled_from(["vector", "image", "dict"]), st.booleans(), st.sampled_from([5, None]), st.integers(0, 99))
 def test_value_and_gradients_against_the_oracle(
@@ -130,34 +119,6 @@ def test_value_and_gradients_against_the_oracle(
     th.testing.assert_close(value, expected)
     for one, other in zip(gradients, th.autograd.grad(expected, trained), strict=True):
         th.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("negatives", [False, True])
-@pytest.mark.parametrize("operator", OPERATORS)
-def test_gradients_reach_encoder_and_predictor(operator: str, negatives: bool) -> None:
-    th.manual_seed(0)
-    head = AuxHead(AuxLoss.parse("{s_t, a_t, r_t+1} -> {s_t+2, r_t}", operator, negatives), LATENT, ACTION)
-    encoder, target_encoder = Encoder(), Encoder()
-    head(gathered(whole_windows(2, 16, "vector"), head.offsets), encoder, target_encoder).backward()
-    trained = [*encoder.parameters(), *head.predictor.parameters()]
-    if (operator, negatives) == ("mse", True):
-        # |y^ - y+|^2 - |y^ - y-|^2 is linear in y^ and its slopes 2 (y- - y+) add up to nothing over the batch.
-        assert trained.pop().grad.abs().max() < 1e-6
-    assert all(parameter.grad.abs().max() > 1e-6 for parameter in trained)
-    # W of the bilinear operator is trained too.
-    assert [name for name, _ in head.operator.named_parameters()] == (["weight"] if operator == "bilinear" else [])
-    assert all(parameter.grad.abs().max() > 1e-6 for parameter in head.operator.parameters())
-    assert all(parameter.grad is None for parameter in target_encoder.parameters())
-
-
-def test_encoder_and_target_encoder_that_are_one() -> None:
-    """Even then the target carries no gradient: predicting s_t perfectly from s_t leaves the encoder alone."""
-    th.manual_seed(0)
-    head = AuxHead(AuxLoss.parse("{s_t} -> {s_t}"), LATENT, ACTION)
-    head.predictor = nn.Identity()  # type: ignore[assignment]
-    encoder = Encoder()
-    value = head(gathered(whole_windows(1, 5, "vector"), head.offsets), encoder, encoder)
-    assert value.item() == 0 and encoder.calls == [True, False]
 
 
 def test_widths_of_the_predictor() -> None:

@@ -7,22 +7,13 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_space import losses
 
 from sb3_aarl import AuxLoss, search_space_size
-from sb3_aarl.aux_loss import OPERATORS, Token
+from sb3_aarl.aux_loss import Token
 
 # A busy machine is no failure.
 relaxed = settings(deadline=None, max_examples=50)
-
-
-@st.composite
-def losses(draw: st.DrawFn, max_horizon: int = 12) -> AuxLoss:
-    """Any valid loss."""
-    horizon = draw(st.integers(1, max_horizon))
-    bits = st.lists(st.booleans(), min_size=3 * horizon + 1, max_size=3 * horizon + 1)
-    source = draw(bits.filter(lambda mask: any(mask[::3])))
-    target = draw(bits.filter(any))
-    return AuxLoss(horizon, tuple(source), tuple(target), draw(st.sampled_from(OPERATORS)), draw(st.booleans()))
 
 
 def as_sets(loss: AuxLoss) -> tuple[set[tuple[str, int]], set[tuple[str, int]]]:
@@ -36,7 +27,7 @@ def smallest_horizon(tokens: set[tuple[str, int]]) -> int:
 
 
 @relaxed
-@given(losses())
+@given(losses(max_horizon=12))
 def test_notation_round_trip(loss: AuxLoss) -> None:
     assert AuxLoss.parse(str(loss)) == loss
     assert AuxLoss.parse(loss.latex(), loss.operator, loss.negatives, loss.horizon) == loss
@@ -45,7 +36,7 @@ def test_notation_round_trip(loss: AuxLoss) -> None:
 
 
 @relaxed
-@given(losses())
+@given(losses(max_horizon=12))
 def test_value_semantics(loss: AuxLoss) -> None:
     twin = AuxLoss(loss.horizon, list(loss.source), list(loss.target), loss.operator, loss.negatives)  # type: ignore[arg-type]
     assert twin == loss and hash(twin) == hash(loss) and len({twin, loss}) == 1
@@ -61,7 +52,7 @@ def test_value_semantics(loss: AuxLoss) -> None:
 
 
 @relaxed
-@given(losses())
+@given(losses(max_horizon=12))
 def test_tokens_are_the_bits_of_the_masks(loss: AuxLoss) -> None:
     source, target = as_sets(loss)
     assert set(loss.source_tokens) == source and set(loss.target_tokens) == target
@@ -74,7 +65,7 @@ def test_tokens_are_the_bits_of_the_masks(loss: AuxLoss) -> None:
 
 
 @relaxed
-@given(losses())
+@given(losses(max_horizon=12))
 def test_canonical_against_sets(loss: AuxLoss) -> None:
     source, target = as_sets(loss)
     start = min(offset for _, offset in source | target)
@@ -238,7 +229,7 @@ FRAGMENTS += ["mse", "bilinear", "negatives", "horizon=3", "horizon=", "{s_t", "
     st.one_of(
         st.text(),
         st.lists(st.sampled_from(FRAGMENTS)).map("".join),
-        losses()
+        losses(max_horizon=12)
         .map(str)
         .flatmap(
             lambda text: st.tuples(st.integers(0, len(text)), st.integers(0, 3), st.text(max_size=3)).map(

@@ -13,11 +13,11 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
-from sb3_aarl.envs import RepeatAction, make_dmc_env
+from sb3_aarl.envs import RepeatAction
 
 
 class Walk(gym.Env):
@@ -125,31 +125,6 @@ def test_the_returns_are_those_of_seeded_episodes_however_many_run_at_once(wrapp
         assert sum(walk.steps for walk in walks) == sum(steps for evaluation in expected for _, steps in evaluation)
 
 
-@pytest.mark.slow
-def test_on_dm_control_several_at_once_give_the_same_returns_bit_for_bit() -> None:
-    """Apart from the rounding of matrix products, which is kept out here: each observation is predicted from alone."""
-    kwargs = {"env_id": "cheetah-run", "action_repeat": 50}
-    model = make_model(make_dmc_env(**kwargs))
-    predict = model.predict
-
-    def one_by_one(observations: np.ndarray, **settings: Any) -> tuple[np.ndarray, None]:
-        return np.stack([predict(observation, deterministic=True)[0] for observation in observations]), None
-
-    def returns(eval_env: gym.Env | VecEnv) -> list[float]:
-        callback = LearningCurveCallback(eval_env, [50], 10, seed=3)
-        callback.init_callback(model)
-        return callback._episode_returns(3)
-
-    env = make_dmc_env(**kwargs)
-    alone = [play(model, env, 3 + episode)[0] for episode in range(2)]
-    model.predict = one_by_one  # type: ignore[method-assign]
-    one = returns(make_dmc_env(**kwargs))
-    np.testing.assert_allclose(one[:2], alone, atol=1e-6)  # Monitor rounds to six digits
-    assert len(set(one)) == 10
-    eval_env = make_vec_env(make_dmc_env, 5, env_kwargs=kwargs, wrapper_class=SingleEpisodes)
-    assert sorted(returns(eval_env)) == sorted(one)
-
-
 def parameters_after(checkpoints: list[int] | None, episodes: int = 3) -> list[th.Tensor]:
     model = make_model(Walk())
     model.learn(40, None if checkpoints is None else LearningCurveCallback(Walk(), checkpoints, episodes))
@@ -160,23 +135,6 @@ def test_an_evaluation_does_not_disturb_training() -> None:
     plain = parameters_after(None)
     watched = parameters_after([10, 11, 25, 40])
     assert all(th.equal(*pair) for pair in zip(plain, watched, strict=True))
-
-
-def test_a_resumed_curve_has_the_same_initial_states() -> None:
-    whole_env = Walk()
-    whole = LearningCurveCallback(whole_env, [10, 20, 30], 2, seed=3)
-    make_model(Walk()).learn(30, whole)
-
-    resumed_env = Walk()
-    resumed = LearningCurveCallback(resumed_env, [10, 20, 30], 2, seed=3, curve=whole.curve[:2])
-    model = make_model(Walk())
-    model.num_timesteps = 20
-    model.learn(10, resumed, reset_num_timesteps=False)
-    assert resumed.curve[:2] == whole.curve[:2]
-    assert [point.environment_steps for point in resumed.curve] == [10, 20, 30]
-    assert resumed.curve[2].seconds >= whole.curve[1].seconds
-    assert len(whole_env.starts) == 6
-    np.testing.assert_array_equal(resumed_env.starts, whole_env.starts[4:])
 
 
 def test_training_ends_when_the_function_returns_false() -> None:

@@ -25,10 +25,7 @@ from typer.testing import CliRunner
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from search.cli.main import app
-from search.cli.search import progress_line
-from search.evolution.sampler import GenerationProgress
 from search.evolution.space import distributions, loss_to_params
-from search.execution.driver import SearchProgress
 from search.execution.storage import open_storage
 from search.training.run import Run
 from search.training.shipped import ZOO
@@ -289,11 +286,6 @@ def test_a_search_in_which_all_fails_is_exit_code_1(folder: Path, executor: Exec
     executor.fails = lambda run: True
     output = run("search", "small.yml", code=1)
     assert "Error: 2 candidates failed one after the other, the last one: it burst (see runs/small/candidates/" in output
-
-
-def test_progress_is_one_line() -> None:
-    progress = SearchProgress([GenerationProgress(1, 125, 80, 4, 3)], 7.0, "a loss", 61.0)
-    assert progress_line(progress) == "generation 1: 80/125 done, 4 running, 3 failed; best 7.00, 0:01:01 to go"
 
 
 @pytest.fixture

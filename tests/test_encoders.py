@@ -52,21 +52,6 @@ def naive_projection(x: np.ndarray, parameters: list[np.ndarray], tanh: bool = F
     return np.tanh(x) if tanh else x
 
 
-@pytest.mark.parametrize("size", [(84, 84), (15, 15), (16, 15), (21, 90)])
-@pytest.mark.parametrize("channels", [1, 9])
-def test_pixel_encoder_takes_any_size(size: tuple[int, int], channels: int) -> None:
-    space = images(channels, *size)
-    encoder = PixelEncoder(space, features_dim=6)
-    observations = preprocess_obs(th.as_tensor(np.stack([space.sample() for _ in range(3)])), space)
-    latents = encoder(observations)
-    assert latents.shape == (3, 6) == (3, encoder.features_dim)
-    trunk = encoder.trunk(observations)
-    assert trunk.shape == (3, encoder.trunk_dim)
-    # The first layer halves the picture and drops its rim, each of the other three takes a pixel on every side.
-    height, width = (int((length - 1) / 2) - 6 for length in size)
-    assert encoder.trunk_dim == 32 * height * width
-
-
 def test_the_papers_sizes() -> None:
     encoder = PixelEncoder(images(9, 84, 84))
     assert encoder.trunk_dim == 32 * 35 * 35 and encoder.features_dim == 50

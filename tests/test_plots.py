@@ -16,9 +16,8 @@ from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution.space import distributions, loss_of, loss_to_params, random_loss
+from search.evolution.space import distributions, loss_to_params, random_loss
 from search.results import analysis
-from search.results.analysis import lineage, ranked
 from search.results.plots import (
     evolution_figure,
     evolution_plot,
@@ -86,33 +85,6 @@ def test_evolution_names_the_candidates():
     candidates = evolution_figure(analysis.trial_table(trials)).data[0]
     assert list(candidates.customdata[0]) == [0, "{s_t, a_t} -&gt; {s_t+1}", "&lt;script&gt;"]
     assert list(candidates.customdata[1]) == [1, "no loss", "-"]
-
-
-def test_figures_are_plain_numbers(trials):
-    """The plotly.js of the dashboard does not know the packed arrays of newer ones."""
-    assert "bdata" not in evolution_figure(analysis.trial_table(trials), BASELINES).to_json()
-
-
-def test_ranked_and_losses(trials):
-    best = ranked(trials)
-    assert [trial.value for trial in best] == sorted(
-        (s for of in scores_by_generation(trials).values() for s in of), reverse=True
-    )
-    assert ranked(trials, StudyDirection.MINIMIZE)[0] is best[-1]
-    assert loss_of(best[0]) == LOSS
-    assert loss_of(trials[32]) is None
-
-
-def test_lineage_reaches_every_ancestor_and_the_latest_comes_first():
-    rng = np.random.default_rng(1)
-    parents = [[]] * 5 + [rng.choice(number, rng.integers(0, 3), replace=False).tolist() for number in range(5, 60)]
-    trials = make_trials(*(make_trial(float(number), parents=of) for number, of in enumerate(parents)))
-
-    def ancestors(number):
-        return {number for parent in parents[number] for number in {parent, *ancestors(parent)}}
-
-    for trial in trials:
-        assert [ancestor.number for ancestor in lineage(trial, trials)] == sorted(ancestors(trial.number), reverse=True)
 
 
 def texts(figure):

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from tiny import DENSE
 
 from sb3_aarl import SACAux
-from sb3_aarl.callbacks import Evaluation, read_curve
+from sb3_aarl.callbacks import read_curve
 from search.training import checkpoint, run
 from search.training.checkpoint import TruncateAt, restart_seed
 from search.training.run import Run, prepare_run, train
@@ -161,23 +161,6 @@ def test_a_killed_run_ends_like_an_undisturbed_one(case: str, tmp_path: Path, pr
     assert curve == expected_curve and len(curve) == N_EVALUATIONS
     assert assert_same(state, expected_state) > 40
     assert not (folder / "checkpoint.pt").exists() and not (folder / "checkpoint.tmp").exists()
-
-
-@pytest.mark.slow
-def test_an_interrupted_run_ends_like_an_undisturbed_one(tmp_path: Path) -> None:
-    """The same in one process, which has drawn other random numbers in between."""
-
-    def interrupt(curve: list[Evaluation]) -> None:
-        raise KeyboardInterrupt
-
-    for name in ("undisturbed", "interrupted"):
-        prepare_run(tmp_path / name, make_run("normalize", checkpoints=(60, 120)))
-    train(tmp_path / "undisturbed")
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path / "interrupted", on_evaluation=interrupt)
-    train(tmp_path / "interrupted")
-    one, other = result(tmp_path / "undisturbed"), result(tmp_path / "interrupted")
-    assert assert_same(one, other) > 40
 
 
 @pytest.mark.slow

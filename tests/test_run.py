@@ -123,11 +123,6 @@ def test_the_device_may_change(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "run.json").read_text())["hyperparameters"]["device"] == "auto"
 
 
-def test_a_run_is_what_it_was_when_it_was_written() -> None:
-    run = make_run(aux_loss=None, hyperparameters={"train_freq": [1, "episode"], "learning_rate": 1e-4}, imports=("math",))
-    assert Run.model_validate_json(run.model_dump_json()) == run
-
-
 # How it ends.
 
 

@@ -56,28 +56,12 @@ def test_a_killed_run_is_resubmitted_and_ends_alike(tmp_path: Path, undisturbed:
     assert [(point.environment_steps, point.mean) for point in submission.curve] == undisturbed == returns(tmp_path)
 
 
-def test_retries_run_out(tmp_path: Path) -> None:
-    with LocalExecutor(1) as executor:
-        submission = Submission(executor, tmp_path, tiny_run(imports=("no_such_module",)), retries=1)
-        wait_done(submission)
-    assert submission.failure is not None and "no_such_module" in submission.failure
-
-
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Python has the working directory first in its path")
 def test_a_search_py_in_the_working_directory_is_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("search.py").write_text("raise SystemExit('not this one')")
     prepare_run(tmp_path / "run", tiny_run())
     assert start_run(str(tmp_path / "run"))["failure"] is None
-
-
-def test_a_finished_run_is_read(tmp_path: Path) -> None:
-    prepare_run(tmp_path, tiny_run())
-    curve = train(tmp_path)
-    started = time.monotonic()
-    result = start_run(str(tmp_path))
-    assert time.monotonic() - started < 0.5
-    assert result == {"curve": [list(point) for point in curve], "failure": None, "retry": False}
 
 
 def test_leaving_the_executor_ends_its_processes(tmp_path: Path) -> None:
@@ -112,14 +96,6 @@ def test_a_matrix_trains_what_is_missing_and_names_what_failed(tmp_path: Path, u
     with LocalExecutor(1) as executor:
         assert list(run_matrix(mended, executor))[-1][:3] == (2, 2, 0)
     assert (cell_folder(tmp_path, Cell("none", "Pendulum-v1", 0)) / "curve.csv").stat().st_mtime_ns == before
-
-
-def test_a_matrix_refuses_folders_of_other_runs(tmp_path: Path) -> None:
-    cell = Cell("SAC", "Pendulum-v1", 0)
-    prepare_run(cell_folder(tmp_path, cell), tiny_run(aux_loss=None))
-    other = Matrix("comparison", tmp_path, {cell: tiny_run(aux_loss=None, hyperparameters={"batch_size": 9})})
-    with LocalExecutor(1) as executor, pytest.raises(ValueError, match="batch_size"):
-        list(run_matrix(other, executor))
 
 
 def test_submitit_is_an_executor(tmp_path: Path, undisturbed: list[Any]) -> None:

@@ -463,20 +463,6 @@ def test_which_loss_moves_the_encoder(kind: str, joint: bool) -> None:
     assert moved_by_train(none) == {"encoder", "q", "actor"}
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_targets_are_moving_averages(kind: str) -> None:
-    model = filled_model(kind, tau=0.1, encoder_tau=0.4, target_update_interval=2)
-    expected = {name: value.clone() for name, value in model.critic.state_dict().items()}
-    assert_same(expected, dict(model.critic_target.state_dict()))
-    for number in range(1, 7):
-        model.train(1, batch_size=16)
-        for name, value in model.critic.state_dict().items():
-            tau = 0.4 if name.startswith("features_extractor.") else 0.1
-            if number % 2 == 0:
-                expected[name] = (1 - tau) * expected[name] + tau * value
-            th.testing.assert_close(model.critic_target.state_dict()[name], expected[name], rtol=0, atol=1e-6)
-
-
 def test_schedules_and_aux_coef() -> None:
     settings = {"learning_rate": 1e-3, "encoder_learning_rate": lambda left: 2e-3 * left, "ent_coef_betas": (0.3, 0.99)}
     model = make_model(ent_coef_learning_rate=lambda left: 1e-2 * left**2, **settings).learn(50)

@@ -306,14 +306,6 @@ def work(url: str, n_trials: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_search_resumes_from_a_file(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/study.db"
-    for n_trials in (2, 3, 9):
-        work(url, n_trials)
-    assert losses_of(make_study(storage=url, **TINY)) == losses_of(run(make_study(**TINY)))
-
-
-@pytest.mark.slow
 def test_two_processes_on_one_study_neither_wait_nor_break(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/study.db"
     study = make_study(storage=url, **TINY)

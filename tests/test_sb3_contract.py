@@ -300,18 +300,6 @@ def test_frame_stack_before_and_after_transposition(n_stack: int) -> None:
     np.testing.assert_array_equal(stacked, frames.reshape(stacked.shape))
 
 
-def test_n_step_returns() -> None:
-    model = make_model(n_steps=3, gamma=0.9)
-    assert_all_train(model, 30)
-    batch = model.replay_buffer.sample(64)
-    # Reward 1 at each step: 1 + gamma + gamma ** 2, less where the episode or the data end.
-    np.testing.assert_allclose(batch.rewards, (1 - batch.discounts) / (1 - 0.9), rtol=1e-5)
-    lengths = np.round(np.log(batch.discounts.numpy()) / np.log(0.9)).ravel()
-    assert set(lengths) == {1, 2, 3}
-    with pytest.raises(AssertionError, match="Dict observation spaces"):
-        make_model(RandomEnv(MIXED), "MultiInputPolicy", n_steps=3)
-
-
 @pytest.mark.parametrize("use_expln", [False, True])
 def test_gsde(use_expln: bool) -> None:
     policy_kwargs = {"use_expln": use_expln, "log_std_init": -2.0, "clip_mean": 1.5}

@@ -20,7 +20,6 @@ from search.evolution.space import (
     check_operators,
     distributions,
     forward_dynamics_prior,
-    is_valid,
     loss_of,
     loss_to_params,
     params_to_loss,
@@ -71,22 +70,6 @@ def test_parameters_and_back(loss: AuxLoss) -> None:
             loss_to_params(loss)
         with pytest.raises(ValueError, match="is not in the space, whose operators are: "):
             loss_to_params(loss, [name for name in OPERATORS if name != loss.operator])
-
-
-def test_valid_is_what_aux_loss_accepts() -> None:
-    n_valid = 0
-    for bits in product([False, True], repeat=8):
-        source, target = bits[:4], bits[4:]
-        try:
-            AuxLoss(1, source, target)
-        except ValueError:
-            assert not is_valid(source, target)
-            assert not is_valid(np.array(source), np.array(target))
-        else:
-            n_valid += 1
-            assert is_valid(source, target)
-            assert is_valid(np.array(source), np.array(target))
-    assert n_valid == 12 * 15
 
 
 def bit_chances(generator: str, source: tuple[bool, ...], target: tuple[bool, ...]) -> list[float]:

@@ -22,7 +22,7 @@ from search.evolution.surrogate import features
 from search.execution.matrix import Cell
 from search.studies import cross_validation, operator_selection
 from search.studies.config import SearchConfig, load_config
-from search.studies.search import SETTINGS_KEY, baselines, make_pruner, open_search, runs_of, settings
+from search.studies.search import SETTINGS_KEY, baselines, make_pruner, open_search, runs_of
 from search.studies.single import prepare_one
 from search.training.config import ConfigError
 from search.training.run import train
@@ -113,12 +113,6 @@ def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None
         assert (run.environment, run.aux_loss, run.threads, run.imports) == ("Pendulum-v1", str(LOSSES[0]), 2, ("json",))
         assert (run.checkpoints, run.evaluation_episodes) == ((200, 400), 1)
         assert run.hyperparameters["policy_kwargs"]["net_arch"] == [8]
-
-
-def test_shown_settings_are_plain(config: SearchConfig) -> None:
-    shown = settings(config)
-    assert json.loads(json.dumps(shown)) == shown
-    assert shown["population_size"] == 3 and shown["batch_size"] == 8 and shown["environment"] == "Pendulum-v1"
 
 
 def test_pruners(config: SearchConfig) -> None:

@@ -4,7 +4,6 @@ import io
 import itertools
 import json
 import math
-import shutil
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -98,21 +97,6 @@ def test_the_papers_scores_are_those_that_it_prints(number: int) -> None:
     assert set(scores["environment"]) <= {*env_ids(), "normalized"}
     zoo = {path.stem for path in (Path(__file__).parent.parent / "zoo_configs").glob("*.yml")}
     assert set(scores["variant"].dropna()) <= zoo
-
-
-@pytest.mark.parametrize(
-    ("variants", "number"),
-    [
-        (["aarl_state"], 4),
-        (["aarl_state", "mine"], 4),
-        (["aarl_state", "aarl_mlp_1"], 6),
-        (["curl_pixel"], 3),
-        (["mine"], None),
-    ],
-    ids=str,
-)
-def test_the_table_with_the_most_variants_is_shown(variants: list[str], number: int | None) -> None:
-    assert table.closest_table(variants) == number
 
 
 def plant(folder: Path, cell: Cell, curve: Mapping[int, float], checkpoints: Sequence[int] = (100_000,), **about: Any) -> Path:
@@ -432,13 +416,6 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
     assert "Runs with different commits: c0ffee (8); c0ffee, beef (1)" in shown
 
 
-def test_two_copies_of_a_run_are_refused(tmp_path: Path) -> None:
-    first = plant(tmp_path, Cell("a", CHEETAH, 0), {100_000: 1.0})
-    shutil.copytree(first, first.with_name("seed-9"))
-    with pytest.raises(ValueError, match=r"seed-0 and .*seed-9 have the same run: a on dm_control/cheetah-run-v0, seed 0"):
-        table.read_runs(tmp_path)
-
-
 def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) -> None:
     ours = {("aarl_state", CHEETAH): np.array([430.0, 440.0]), ("curl_state", CHEETAH): np.array([189.0, 191.0])}
     plant_scores(tmp_path, ours)
@@ -462,17 +439,3 @@ def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) 
 def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="has no runs of a benchmark"):
         table.read_tables(tmp_path)
-
-
-def test_runs_of_the_first_version_are_read() -> None:
-    """They have no run.json."""
-    folder = Path(__file__).parent.parent / "results" / "choices"
-    number, runs, comparison, _, _ = table.read_tables(folder)
-    assert number == 4 and runs["mean"].notna().all()
-    last = [pd.read_csv(path / "curve.csv")["mean"].iloc[-1] for path in (folder / "curl_state_bf16/cheetah-run").iterdir()]
-    row = comparison.set_index("variant").loc["curl_state_bf16"]
-    assert (row["mean"], row["std"], row["column"]) == (
-        pytest.approx(np.mean(last)),
-        pytest.approx(np.std(last, ddof=1)),
-        "CURL",
-    )

@@ -14,11 +14,6 @@ from sb3_aarl.aux_loss import LONGEST_HORIZON, OPERATORS, AuxLoss, Token
 MAX_HORIZON = 10  # paper, section 2.1
 
 
-def is_valid(source: Sequence[bool] | np.ndarray, target: Sequence[bool] | np.ndarray) -> bool:
-    """The paper's loss rejection (A.3): at least one state in the source, and a target that is not empty."""
-    return any(source[::3]) and any(target)
-
-
 def check_operators(operators: Sequence[str] | None) -> None:
     """Raise a ValueError that names what is no operator; None is where the operator is not searched."""
     unknown = [name for name in operators or () if name not in OPERATORS]
@@ -156,7 +151,7 @@ def random_loss(
         masks = rng.random(chances.shape) < chances
         if flips_states:
             masks[1, ::3] = ~masks[0, ::3]
-        if is_valid(*masks):
+        if masks[0, ::3].any() and masks[1].any():  # the paper's loss rejection (A.3)
             of_source, of_target = map(tuple, masks.tolist())
             return AuxLoss(horizon, of_source, of_target, *random_operator(rng, operators))
 
