@@ -22,6 +22,7 @@ from search.cli.main import app
 from search.execution.matrix import cell_folder
 from search.execution.storage import load_study, open_storage
 from search.results.analysis import analysed, trial_table
+from search.results.report import stored_baselines
 from search.results.statistics import interquartile_means
 from search.results.table import paper_scores, read_runs
 from search.studies import benchmark
@@ -136,12 +137,19 @@ def test_mean_of_the_best_of_some_scores() -> None:
 
 def test_a_search_found_what_its_text_says() -> None:
     """results/search/cheetah_run_simba/about.md is right about its study."""
-    study = load_study(open_storage(RESULTS / "search" / "cheetah_run_simba", create=False))
+    study_folder = RESULTS / "search" / "cheetah_run_simba"
+    study = load_study(open_storage(study_folder, create=False))
     trials = analysed(trial_table(study.get_trials(deepcopy=False)))
     evolved = trials[trials["operation"].isin(make_readme["EVOLVED"])]["score"]
     random, given = (trials[trials["operation"] == operation]["score"] for operation in ("random", "given"))
     assert mannwhitneyu(evolved, random, alternative="greater").pvalue < 1e-6
     assert evolved.mean() < given.mean() and evolved.max() < given.max()
+    readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
+    shown = [make_readme["summary"](scores.tolist()).partition(" (")[0] for scores in (evolved, random)]
+    assert f"{len(trials)} candidates" in readme and f"The best, {given.max():.0f}," in readme
+    assert "evolved losses score {}, random ones {},".format(*shown) in readme
+    baselines = dict(stored_baselines(study_folder))
+    assert f"AARL-State {baselines['AARL-State']:.0f}, no loss {baselines['No auxiliary loss']:.0f}." in readme
     first, second, *later = trials.groupby("generation")["score"].mean()
     assert first < second and max(later) < second + 5
 
