@@ -86,16 +86,16 @@ def section(folder: Path, results: Path) -> Iterator[str]:
     yield from printed(f"aarl table {name}")
     abouts = read_abouts(folder)
     yield from paper(abouts.values())
-    finished = [(path, about) for path, about in abouts.items() if "seconds" in about]
+    trained = [(path, about) for path, about in abouts.items() if (path / "curve.csv").exists()]
     yield "| run | return | mean of the evaluations | minutes | threads | processor | commit | date |"
     yield "|---|---|---|---|---|---|---|---|"
-    for path, about in finished:
+    for path, about in trained:
         curve, sessions = read_curve(path / "curve.csv"), about["sessions"]
         cells = [
             f"[{path.relative_to(folder).as_posix()}]({path.relative_to(results).as_posix()}/curve.csv)",
-            f"{curve[-1].mean:.1f} at {curve[-1].environment_steps:,}",
+            f"{curve[-1].mean:.1f} at {curve[-1].environment_steps:,}{'' if 'seconds' in about else ', unfinished'}",
             f"{statistics.mean(point.mean for point in curve):.1f}",
-            f"{about['seconds'] / 60:.0f}",
+            f"{curve[-1].seconds / 60:.0f}",
             *(
                 ", ".join(dict.fromkeys(str(session[key]) for session in sessions))
                 for key in ("threads", "cpu" if sessions[-1]["gpu"] == "none" else "gpu", "commit")
@@ -105,9 +105,9 @@ def section(folder: Path, results: Path) -> Iterator[str]:
         yield f"| {' | '.join(cells)} |"
     yield "\nMade again by (`--folder` another folder, `--workers` for several at once):\n"
     yield "```bash"
-    yield from commands(about for _, about in finished)
+    yield from commands(about for _, about in trained)
     yield "```\n"
-    yield from cost([about for _, about in finished if "program" not in about])
+    yield from cost([about for _, about in trained if "seconds" in about and "program" not in about])
 
 
 def search_section(folder: Path, results: Path) -> Iterator[str]:
