@@ -83,7 +83,7 @@ def section(folder: Path, results: Path) -> Iterator[str]:
     name = folder.relative_to(results.parent).as_posix()
     yield f"## {title}\n"
     yield text.strip() + "\n"
-    yield from printed(f"aarl table {name}")
+    yield from printed(f"aarl table {name}", results.parent)
     abouts = read_abouts(folder)
     yield from paper(abouts.values())
     trained = [(path, about) for path, about in abouts.items() if (path / "curve.csv").exists()]
@@ -124,7 +124,7 @@ def search_section(folder: Path, results: Path) -> Iterator[str]:
     yield text.strip() + "\n"
     study = load_study(open_storage(folder, create=False))
     if len(study.user_attrs[SETTINGS_KEY]["seeds"]) > 1:
-        yield from printed(f"python benchmarks/fidelity.py {name}")
+        yield from printed(f"python benchmarks/fidelity.py {name}", results.parent)
         return
     trials = analysed(trial_table(study.get_trials(deepcopy=False)))
     evolved, random = trials[trials["operation"].isin(EVOLVED)], trials[trials["operation"] == "random"]
@@ -145,7 +145,7 @@ def search_section(folder: Path, results: Path) -> Iterator[str]:
     for row in trials.nlargest(BEST, "score").to_dict("records"):
         yield f"| {row['number']} | {row['generation']} | {row['operation']} | {row['score']:.0f} | `{row['loss']}` |"
     yield ""
-    yield from printed(f"aarl analyze {name}")
+    yield from printed(f"aarl analyze {name}", results.parent)
     for part, scores_of in ((part, stored_scores(folder / part)) for part in ("baselines", "cross-validation")):
         if not scores_of.empty:
             yield f"{part.capitalize()}, AULC:\n"
@@ -177,16 +177,17 @@ def mean_of_best(scores: list[float], n: int) -> float:
     return sum(score * way for score, way in zip(sorted(scores), ways, strict=True)) / math.comb(len(scores), n)
 
 
-def printed(command: str) -> Iterator[str]:
+def printed(command: str, cwd: Path) -> Iterator[str]:
     """
     A command and what it prints.
 
-    :param command: ``aarl ...`` or ``python ...``, run beside results/
+    :param command: ``aarl ...`` or ``python ...``
+    :param cwd: Where it is run: beside results/
     """
     name, *arguments = command.split()
     program = [sys.executable, *(["-m", "search.cli.main"] if name == "aarl" else []), *arguments]
     environment = {**os.environ, "COLUMNS": "120", "NO_COLOR": "1"}
-    text = subprocess.run(program, env=environment, cwd=RESULTS.parent, text=True, stdout=subprocess.PIPE, check=True).stdout
+    text = subprocess.run(program, env=environment, cwd=cwd, text=True, stdout=subprocess.PIPE, check=True).stdout
     yield f"`{command}`:\n"
     yield "```text"
     yield "\n".join(line.rstrip() for line in text.strip().splitlines())
