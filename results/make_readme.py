@@ -18,7 +18,7 @@ from typing import Any
 from scipy.stats import mannwhitneyu
 
 from sb3_aarl.callbacks import read_curve
-from search.execution.matrix import stored_scores
+from search.execution.matrix import comparable, stored_scores
 from search.execution.storage import STUDY_FILE, load_study, open_storage
 from search.results.analysis import analysed, trial_table
 from search.results.table import closest_table, paper_scores
@@ -55,11 +55,7 @@ def readme(results: Path) -> str:
 
     :param results: Folder with benchmarks' folders in it
     """
-    sections = [
-        line
-        for folder in folders(results)
-        for line in (search_section if (folder / STUDY_FILE).exists() else section)(folder, results)
-    ]
+    sections = [line for folder in folders(results) for line in section(folder, results)]
     return "\n".join([INTRODUCTION, *(sections or ["No run is finished yet."])]).strip() + "\n"
 
 
@@ -74,15 +70,25 @@ def folders(results: Path) -> list[Path]:
 
 def section(folder: Path, results: Path) -> Iterator[str]:
     """
-    The section of a benchmark: its text, its tables, its runs and their cost.
+    The section of a benchmark or a search: its text, and what it found.
+
+    :param folder: Folder of the benchmark or the search
+    :param results: Folder it is in
+    """
+    title, _, text = (folder / ABOUT).read_text(encoding="utf-8").partition("\n")
+    yield f"## {title}\n"
+    yield text.strip() + "\n"
+    yield from (search_section if (folder / STUDY_FILE).exists() else benchmark_section)(folder, results)
+
+
+def benchmark_section(folder: Path, results: Path) -> Iterator[str]:
+    """
+    The tables of a benchmark, its runs and their cost.
 
     :param folder: Folder of the benchmark
     :param results: Folder it is in
     """
-    title, _, text = (folder / ABOUT).read_text(encoding="utf-8").partition("\n")
     name = folder.relative_to(results.parent).as_posix()
-    yield f"## {title}\n"
-    yield text.strip() + "\n"
     yield from printed(f"aarl table {name}", results.parent)
     abouts = read_abouts(folder)
     yield from paper(abouts.values())
@@ -112,16 +118,13 @@ def section(folder: Path, results: Path) -> Iterator[str]:
 
 def search_section(folder: Path, results: Path) -> Iterator[str]:
     """
-    The section of a search: its text, what its generations found, its best losses, all that ``aarl analyze`` says, and its
-    matrices.
+    What the generations of a search found, its best losses, all that ``aarl analyze`` says, and of its matrices the variants
+    that can be compared.
 
     :param folder: Folder of the search
     :param results: Folder it is in
     """
-    title, _, text = (folder / ABOUT).read_text(encoding="utf-8").partition("\n")
     name = folder.relative_to(results.parent).as_posix()
-    yield f"## {title}\n"
-    yield text.strip() + "\n"
     study = load_study(open_storage(folder, create=False))
     if len(study.user_attrs[SETTINGS_KEY]["seeds"]) > 1:
         yield from printed(f"python benchmarks/fidelity.py {name}", results.parent)
@@ -146,11 +149,12 @@ def search_section(folder: Path, results: Path) -> Iterator[str]:
         yield f"| {row['number']} | {row['generation']} | {row['operation']} | {row['score']:.0f} | `{row['loss']}` |"
     yield ""
     yield from printed(f"aarl analyze {name}", results.parent)
-    for part, scores_of in ((part, stored_scores(folder / part)) for part in ("baselines", "cross-validation")):
-        if not scores_of.empty:
+    for part in ("baselines", "cross-validation"):
+        runs = comparable(stored_scores(folder / part))
+        if not runs.empty:
             yield f"{part.capitalize()}, AULC:\n"
             yield "```text"
-            yield ranking(scores_of).round(1).to_string()
+            yield ranking(runs).round(1).to_string()
             yield "```\n"
 
 
