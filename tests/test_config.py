@@ -311,7 +311,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"checkpoints": []}, r"checkpoints: .*not \[\]"),
     ({"checkpoints": [800, 400]}, "checkpoints: must be environment steps in ascending order"),
     ({"checkpoints": [0, 400]}, r"checkpoints\[0\]: should be greater than 0"),
-    ({"checkpoints": [401]}, r"checkpoints: must be multiples of 4 .*cheetah-run-v0.*\[401\] are not"),
+    ({"checkpoints": [401]}, r"cheetah-run-v0: checkpoints must be multiples of 4 .*\[401\] are not"),
     ({"checkpoints": [402], "overrides": {"n_envs": 3, "env_kwargs": {"action_repeat": 2}}}, None),
     ({"checkpoints": [404], "overrides": {"n_envs": 3, "env_kwargs": {"action_repeat": 2}}}, "multiples of 6"),
     ({"checkpoints": [400, 1.5]}, r"checkpoints\[1\]: should be a valid integer, not 1.5"),

@@ -15,7 +15,7 @@ from sb3_aarl.envs import PREFIX
 from search.execution.matrix import Cell, Matrix, task_name
 from search.training.config import ConfigError, action_repeat, import_modules, load_hyperparameters, read_yaml, resolve_env_id
 from search.training.provenance import ABOUT, read_about
-from search.training.run import FREE, Run, check_run, checkpoint_interval, differences, partial_curve
+from search.training.run import FREE, Run, check_checkpoints, check_run, differences, partial_curve
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
@@ -55,7 +55,9 @@ def load_benchmark(
     for seed, environment, variant in product(seeds, ids, paths):
         cell = Cell(variant, environment, seed)
         settings, steps = hyperparameters[cell[:2]], compared[cell.environment]
-        evaluations = _evaluations(steps, every, checkpoint_interval(settings), cell)
+        between = () if every is None else range(every, steps[-1], every)
+        evaluations = tuple(sorted({*steps, *between}))
+        check_checkpoints(evaluations, settings, f"{cell.variant} on {environment}")
         loss = settings["aux_loss"]
         runs[cell] = Run(
             environment=cell.environment,
@@ -155,17 +157,6 @@ def _default_checkpoints(environment: str, hyperparameters: Mapping[tuple[str, s
     if budget < CHECKPOINTS[0]:
         raise ConfigError(f"n_timesteps ends the runs on {environment} at {budget} environment steps: name checkpoints")
     return tuple(step for step in CHECKPOINTS if step <= budget)
-
-
-def _evaluations(checkpoints: Sequence[int], every: int | None, interval: int, cell: Cell) -> tuple[int, ...]:
-    """The environment steps of all evaluations of a run."""
-    between = () if every is None else range(every, checkpoints[-1], every)
-    steps = sorted({*checkpoints, *between})
-    for step in steps:
-        if step % interval:
-            where = f"{cell.variant}: evaluations on {cell.environment}"
-            raise ConfigError(f"{where} must be at multiples of {interval} (train_freq x n_envs x action repeat), not {step}")
-    return tuple(steps)
 
 
 def _check_folder(matrix: Matrix) -> None:

@@ -22,7 +22,7 @@ from search.evolution.sampler import AuxLossSampler
 from search.evolution.space import MAX_HORIZON, loss_to_params
 from search.training import config as training
 from search.training.config import ConfigError
-from search.training.run import checkpoint_interval
+from search.training.run import check_checkpoints
 from search.training.shipped import find_file
 
 
@@ -218,10 +218,6 @@ def load_config(path: str | Path) -> SearchConfig:
     own = [config.environment, *(config.operator_selection.environments if config.operator_selection else ())]
     for env_id in dict.fromkeys([*own, *validated]):
         for baseline in (None, *(config.baselines if env_id == config.environment else ())):
-            interval = checkpoint_interval(config.hyperparameters_for(env_id, baseline))
             steps = {*others.get(env_id, config.checkpoints), *(config.checkpoints if env_id in own else ())}
-            between = [step for step in sorted(steps) if step % interval]
-            if between:
-                of_what = f"{interval} (train_freq x n_envs x action repeat of {env_id})"
-                raise ConfigError(f"{path}: checkpoints: must be multiples of {of_what}, {between} are not")
+            check_checkpoints(steps, config.hyperparameters_for(env_id, baseline), f"{path}: {env_id}")
     return config

@@ -11,7 +11,7 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -178,6 +178,13 @@ def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
     return rollout * hyperparameters.get("n_envs", 1) * action_repeat(hyperparameters)
 
 
+def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, Any], source: str) -> None:
+    interval = checkpoint_interval(hyperparameters)
+    if between := [steps for steps in sorted(checkpoints) if steps % interval]:
+        of_what = f"{interval} (train_freq x n_envs x action repeat)"
+        raise ConfigError(f"{source}: checkpoints must be multiples of {of_what}, {between} are not")
+
+
 def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int = 1) -> tuple[int, ...]:
     """Equally spaced checkpoints, multiples of an interval; the last is a little early where they do not divide the run."""
     if n_evaluations < 1 or environment_steps < n_evaluations * interval:
@@ -202,11 +209,8 @@ class Setup:
         self.run = run
         import_modules(run.imports)
         settings = check_hyperparameters(run.hyperparameters, run.environment, source)
-        self.action_repeat, interval = action_repeat(settings), checkpoint_interval(settings)
-        for steps in run.checkpoints:
-            if steps % interval:
-                problem = f"is no multiple of train_freq x n_envs x action repeat, {interval} environment steps"
-                raise ConfigError(f"{source}: checkpoint {steps} {problem}")
+        self.action_repeat = action_repeat(settings)
+        check_checkpoints(run.checkpoints, settings, source)
         train_freq = settings.get("train_freq")
         if isinstance(train_freq, tuple) and train_freq[1] == "episode" and train_freq[0] > 1:
             raise ConfigError(f"{source}: train_freq must be 1 episode at most: a rollout has to end at each checkpoint")
