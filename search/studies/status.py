@@ -1,9 +1,7 @@
 """How far a search with the matrices in its folder is, or a benchmark. Nothing is started."""
 
 import inspect
-from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import optuna
 import pandas as pd
@@ -15,7 +13,7 @@ from search.evolution.sampler import AuxLossSampler
 from search.execution import driver
 from search.studies.search import SETTINGS_KEY
 from search.training.provenance import read_about
-from search.training.run import LOCK, RUN, Outcome, read_outcome
+from search.training.run import LOCK, RUN, read_outcome
 
 # Folders of matrices in that of a search.
 PARTS = ("baselines", "cross-validation", "operators")
@@ -32,28 +30,28 @@ def search_status(study: optuna.Study, folder: Path) -> tuple[driver.SearchProgr
 
 def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     """
-    One row for each variant of a matrix, with the mean AULC of what is done, None where it is of several environments; and the
+    One row for each variant of a matrix, with the mean AULC of what is done, NaN where it is of several environments; and the
     estimated seconds until all are over, None while that is not known.
     """
-    runs: dict[str, list[tuple[Outcome | None, bool]]] = defaultdict(list)
-    tasks: dict[str, set[str]] = defaultdict(set)
+    rows = []
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
         outcome = read_outcome(path)
-        variant = read_about(path)["variant"]
-        runs[variant].append((outcome, outcome is None and is_locked(path / LOCK)))
-        tasks[variant].add(path.parent.name)
-    rows: list[dict[str, Any]] = []
-    seconds: list[float] = []
-    for variant, found in runs.items():
-        done = [outcome.curve for outcome, _ in found if outcome is not None and outcome.failure is None]
-        seconds += [curve[-1].seconds for curve in done]
-        row = {"variant": variant, "runs": len(found), "done": len(done), "running": sum(runs for _, runs in found)}
-        row["failed"] = sum(outcome is not None for outcome, _ in found) - len(done)
-        rows.append({**row, "score": sum(map(aulc, done)) / len(done) if done and len(tasks[variant]) == 1 else None})
-    table = pd.DataFrame(rows, columns=["variant", "runs", "done", "running", "failed", "score"])
-    left = int((table["runs"] - table["done"] - table["failed"]).sum())
-    to_go = sum(seconds) / len(seconds) * left / max(1, int(table["running"].sum())) if seconds else None
-    return table, to_go
+        row = {"variant": read_about(path)["variant"], "task": path.parent.name, "done": 0, "running": 0, "failed": 0}
+        if outcome is None:
+            row["running"] = is_locked(path / LOCK)
+        elif outcome.failure is not None:
+            row["failed"] = 1
+        else:
+            row |= {"done": 1, "score": aulc(outcome.curve), "seconds": outcome.curve[-1].seconds}
+        rows.append(row)
+    runs = pd.DataFrame(rows, columns=["variant", "task", "done", "running", "failed", "score", "seconds"])
+    by_variant = runs.groupby("variant", sort=False)
+    table = by_variant[["done", "running", "failed"]].sum().astype(int)
+    table.insert(0, "runs", by_variant.size())
+    table["score"] = by_variant["score"].mean().where(by_variant["task"].nunique() == 1)
+    left = len(runs) - runs["done"].sum() - runs["failed"].sum()
+    to_go = runs["seconds"].mean() * left / max(1, runs["running"].sum())
+    return table.reset_index(), float(to_go) if runs["done"].any() else None
 
 
 def is_locked(path: Path) -> bool:
