@@ -222,8 +222,9 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(name: str, monke
         ("Pendulum-v1", "--ray-address auto", "--ray-address needs --executor ray"),
         ("CartPole-v1", "", "CartPole-v1 cannot be trained"),
         ("Pendulum-v1\nstages: 3", "", "small.yml: stages"),
+        ("Pendulum-v1\noverrides: {env_kwargs: {action_repeat: 100}}", "", "max_horizon: 300 environment steps"),
     ],
-    ids=["cpus", "address", "actions", "key"],
+    ids=["cpus", "address", "actions", "key", "horizon"],
 )
 def test_what_cannot_be_searched_is_refused_before_anything_is_made(
     environment: str, options: str, message: str, folder: Path

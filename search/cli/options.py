@@ -60,10 +60,15 @@ def read_config(path: Path, **changes: Any) -> "SearchConfig":
     """The configuration of a search, with the values of options over those of its file; that its runs can start is checked."""
     from search.studies.config import load_config
     from search.studies.search import make_run
+    from search.training.config import ConfigError
     from search.training.run import check_run
 
     config = load_config(path).model_copy(update={key: value for key, value in changes.items() if value is not None})
-    check_run(make_run(config, config.environment, None, config.seeds[0]))
+    setup = check_run(make_run(config, config.environment, None, config.seeds[0]))
+    if setup.episode_steps is not None and setup.episode_steps < (horizon := config.max_horizon * setup.action_repeat):
+        raise ConfigError(
+            f"{path}: max_horizon: {horizon} environment steps, episodes of {config.environment} have {setup.episode_steps}"
+        )
     return config
 
 

@@ -160,8 +160,9 @@ def resolve_env_id(name: str) -> str:
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
     nearest = ", ".join(difflib.get_close_matches(name, known))
     hints = [f"The nearest: {nearest}."] if nearest else []
-    hints += [] if env_ids() or "-v" in name else [f"{NEEDS_DMC}."]
-    hints += ["A module of yours that registers it belongs to the imports (--imports, or imports: in the file)"]
+    hints += [] if env_ids() or ("-v" in name and not name.startswith(PREFIX)) else [f"{NEEDS_DMC}."]
+    if not name.startswith(PREFIX):
+        hints += ["A module of yours that registers it belongs to the imports (--imports, or imports: in the file)"]
     raise ConfigError(f"unknown environment {name!r}. {' '.join(hints)}")
 
 

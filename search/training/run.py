@@ -264,8 +264,8 @@ class Setup:
         return SACAux(self.policy or fitting, env, **self.settings)
 
 
-def check_run(run: Run) -> None:
-    """Make environment and model of a run once, and make a step; warn of what a user may not have meant."""
+def check_run(run: Run) -> Setup:
+    """Make environment and model of a run once, and make a step; warn of what a user may not have meant. Return its setup."""
     try:
         setup = Setup(run, run.environment)
         with closing_env(setup.training_env()) as env:
@@ -290,6 +290,7 @@ def check_run(run: Run) -> None:
     elif apart < setup.episode_steps * setup.n_envs:
         message = "evaluating every %d environment steps truncates episodes, which may have %d"
         logger.warning(message, apart // setup.n_envs, setup.episode_steps)
+    return setup
 
 
 @contextlib.contextmanager
