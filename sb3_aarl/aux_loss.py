@@ -191,7 +191,7 @@ class AuxLoss:
         unknown = set(values) - {"loss", "operator", "negatives", "horizon"}
         if unknown or not isinstance(values.get("loss"), str):
             problem = f"unknown key {min(map(str, unknown))!r}" if unknown else "no notation under 'loss'"
-            raise ValueError(f"{problem} in the auxiliary loss {dict(values)!r}")
+            raise ValueError(f"{problem}: the keys of an auxiliary loss are loss (its notation), operator, negatives, horizon")
         return cls.parse(**{"text" if key == "loss" else key: value for key, value in values.items()})
 
 
