@@ -25,6 +25,7 @@ from typer.testing import CliRunner
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from search.cli.main import app
+from search.cli.options import read_config
 from search.evolution.space import distributions, loss_to_params
 from search.execution.storage import open_storage
 from search.training.run import Run
@@ -222,9 +223,8 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(name: str, monke
         ("Pendulum-v1", "--ray-address auto", "--ray-address needs --executor ray"),
         ("CartPole-v1", "", "CartPole-v1 cannot be trained"),
         ("Pendulum-v1\nstages: 3", "", "small.yml: stages"),
-        ("Pendulum-v1\noverrides: {env_kwargs: {action_repeat: 100}}", "", "max_horizon: 300 environment steps"),
     ],
-    ids=["cpus", "address", "actions", "key", "horizon"],
+    ids=["cpus", "address", "actions", "key"],
 )
 def test_what_cannot_be_searched_is_refused_before_anything_is_made(
     environment: str, options: str, message: str, folder: Path
@@ -232,6 +232,12 @@ def test_what_cannot_be_searched_is_refused_before_anything_is_made(
     write_search(folder, SEARCH.replace("Pendulum-v1", environment))
     assert message in run("search", "small.yml", *options.split(), code=2)
     assert not Path("runs").exists()
+
+
+def test_a_search_warns_of_horizons_that_no_episode_has(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_search(folder, SEARCH + "overrides: {env_kwargs: {action_repeat: 100}}\n")
+    read_config(Path("small.yml"))
+    assert "max_horizon is 300 environment steps, episodes have 200" in caplog.text
 
 
 def test_a_folder_is_that_of_one_search(folder: Path, executor: Executor) -> None:

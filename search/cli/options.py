@@ -1,5 +1,6 @@
 """Options that several commands have, and the folders and studies that they name."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
     from optuna import Study
 
     from search.studies.config import SearchConfig
+
+logger = logging.getLogger(__name__)
 
 SearchFile = Annotated[
     Path,
@@ -60,15 +63,13 @@ def read_config(path: Path, **changes: Any) -> "SearchConfig":
     """The configuration of a search, with the values of options over those of its file; that its runs can start is checked."""
     from search.studies.config import load_config
     from search.studies.search import make_run
-    from search.training.config import ConfigError
     from search.training.run import check_run
 
     config = load_config(path).model_copy(update={key: value for key, value in changes.items() if value is not None})
     setup = check_run(make_run(config, config.environment, None, config.seeds[0]))
     if setup.episode_steps is not None and setup.episode_steps < (horizon := config.max_horizon * setup.action_repeat):
-        raise ConfigError(
-            f"{path}: max_horizon: {horizon} environment steps, episodes of {config.environment} have {setup.episode_steps}"
-        )
+        message = "max_horizon is %d environment steps, episodes have %d: losses of longer horizons are never trained"
+        logger.warning(message, horizon, setup.episode_steps)
     return config
 
 

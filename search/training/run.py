@@ -179,6 +179,7 @@ def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
 
 
 def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, Any], source: str) -> None:
+    """Every checkpoint has to be the end of a rollout."""
     interval = checkpoint_interval(hyperparameters)
     if between := [steps for steps in sorted(checkpoints) if steps % interval]:
         of_what = f"{interval} (train_freq x n_envs x action repeat)"
