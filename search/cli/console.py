@@ -100,7 +100,7 @@ def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
     if not kinds:
         say("All runs are finished.")
         return
-    say(f"Measuring {len(kinds)} kinds of runs, some seconds each ...")
+    say(f"Measuring some seconds of each kind of run ({len(kinds)}) ...")
     found = costs(kinds)
     formats = dict.fromkeys(("runs", "environment steps", "gradient steps"), "{:,}")
     formats |= dict.fromkeys(("ms an environment step", "ms a gradient step", "hours of a run", "core hours"), "{:.2g}")

@@ -160,9 +160,11 @@ def resolve_env_id(name: str) -> str:
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
     nearest = ", ".join(difflib.get_close_matches(name, known))
     hints = [f"The nearest: {nearest}."] if nearest else []
-    hints += [] if env_ids() or ("-v" in name and not name.startswith(PREFIX)) else [f"{NEEDS_DMC}."]
-    if not name.startswith(PREFIX):
-        hints += ["A module of yours that registers it belongs to the imports (--imports, or imports: in the file)"]
+    is_dmc = name.startswith(PREFIX)
+    if not env_ids() and (is_dmc or "-v" not in name):
+        hints.append(f"{NEEDS_DMC}.")
+    if not is_dmc:
+        hints.append("A module of yours that registers it belongs to the imports (--imports, or imports: in the file)")
     raise ConfigError(f"unknown environment {name!r}. {' '.join(hints)}")
 
 
