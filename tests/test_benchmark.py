@@ -91,6 +91,9 @@ def test_evaluations_in_between_are_no_checkpoints() -> None:
         assert about["hyperparameters"] == load_hyperparameters("mine.yml", ENV)
 
 
+BETWEEN = r"multiples of 4 \(.*action repeat\), "
+
+
 @pytest.mark.parametrize(
     ("names", "options", "message"),
     [
@@ -101,16 +104,8 @@ def test_evaluations_in_between_are_no_checkpoints() -> None:
         ("mine.yml", {"environments": ["Hopper-v5"]}, "mine.yml: neither 'Hopper-v5' nor 'default' is there"),
         ("default.yml", {"environments": ["CartPole-v1"]}, "CartPole-v1 cannot be trained .*Discrete"),
         ("mine.yml", {"checkpoints": []}, f"n_timesteps ends the runs on {ENV} at 400 environment steps: name checkpoints"),
-        (
-            "default.yml",
-            {"environments": ["reacher-easy"], "checkpoints": [302]},
-            r"multiples of 4 \(.*action repeat\), \[302\] are not",
-        ),
-        (
-            "default.yml",
-            {"environments": ["reacher-easy"], "every": 6},
-            r"multiples of 4 \(.*action repeat\), \[6, .* are not",
-        ),
+        ("default.yml", {"environments": ["reacher-easy"], "checkpoints": [302]}, BETWEEN + r"\[302\] are not"),
+        ("default.yml", {"environments": ["reacher-easy"], "every": 6}, BETWEEN + r"\[6, .* are not"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(names: str, options: dict[str, Any], message: str, folder: Path) -> None:
