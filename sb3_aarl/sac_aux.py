@@ -108,8 +108,8 @@ class SACAux(SAC):
         and shifts if not. Vectors are never augmented
     :param crop_size: Height and width in pixels of cropped images, None for 84. Where it is given, images must not be smaller
     :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16; parameters, optimizers, Q
-        targets, entropy, losses and predictions stay float32. Faster where the device has instructions for it, many times
-        slower elsewhere (x86 processors without AVX-512; logs a warning)
+        targets, entropy, losses and predictions stay float32. A device without instructions for it (of x86 processors those
+        without AVX-512) would be ten times slower: it computes in float32, and logs a warning
     :param compile: Whether ``torch.compile`` compiles the losses, for a minute of the first gradient steps. It pays for wide
         networks and long runs; without a C++ compiler logs a warning and goes on as it was
     :raises ValueError: for arguments that do not fit, with the culprit's name
@@ -255,7 +255,7 @@ class SACAux(SAC):
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=rate, betas=self.ent_coef_betas)
         self._setup_aux_loss()
         if self.precision == "bf16" and not _computes_bf16(self.device):
-            logger.warning("precision='bf16': this %s has no instructions for it, fp32 is faster", self.device.type.upper())
+            logger.warning("precision='bf16': this %s has no instructions for it, training in fp32", self.device.type.upper())
         if self.compile:
             self._compile_losses()
 
@@ -353,7 +353,8 @@ class SACAux(SAC):
         self.policy.set_training_mode(True)
         self._update_learning_rates()
         # Networks compute in bfloat16 if asked to; their outputs, and all that is computed from them, are float32.
-        autocast = th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bf16")
+        bf16 = self.precision == "bf16" and _computes_bf16(self.device)
+        autocast = th.autocast(self.device.type, th.bfloat16, enabled=bf16)
         started = time.perf_counter()
         with self._logged() as log:
             for _ in range(gradient_steps):

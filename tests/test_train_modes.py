@@ -30,17 +30,26 @@ class Operations(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(("capability", "slow"), [("DEFAULT", True), ("AVX2", True), ("AVX512", False)])
-def test_bfloat16_without_instructions_logs_a_warning(
+def test_without_instructions_for_bfloat16_trains_in_fp32_with_a_warning(
     capability: str, slow: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(sac_aux.th.backends.cpu, "get_cpu_capability", lambda: capability)
-    make_model(precision="fp32")
+    monkeypatch.setattr(th.backends.cpu, "get_cpu_capability", lambda: capability)
+    exact = make_model(precision="fp32", seed=0).learn(40)
     assert not caplog.records
-    make_model(precision="bf16")
-    expected = ["precision='bf16': this CPU has no instructions for it, fp32 is faster"] * slow
+    model = make_model(precision="bf16", seed=0).learn(40)
+    expected = ["precision='bf16': this CPU has no instructions for it, training in fp32"] * slow
     assert [record.getMessage() for record in caplog.records] == expected
+    same = all(th.equal(one, other) for one, other in zip(exact.critic.parameters(), model.critic.parameters(), strict=True))
+    assert same == slow
 
 
+@pytest.fixture
+def computes_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bfloat16 on any processor, if slowly."""
+    monkeypatch.setattr(sac_aux, "_computes_bf16", lambda device: True)
+
+
+@pytest.mark.usefixtures("computes_bf16")
 @pytest.mark.parametrize("kind", KINDS)
 def test_bfloat16_is_what_networks_compute_in_and_nothing_else(kind: str) -> None:
     model = filled_model(kind, precision="bf16", policy_delay=1, aux_loss="{s_t, a_t} -> {s_t+1, r_t} [bilinear, negatives]")
@@ -66,6 +75,7 @@ def test_bfloat16_is_what_networks_compute_in_and_nothing_else(kind: str) -> Non
         assert parameter.grad is not None and parameter.grad.dtype == th.float32
 
 
+@pytest.mark.usefixtures("computes_bf16")
 @pytest.mark.parametrize("kind", KINDS)
 def test_bfloat16_computes_almost_the_same_gradients(kind: str) -> None:
     gradients = []
@@ -87,6 +97,7 @@ def test_bfloat16_computes_almost_the_same_gradients(kind: str) -> None:
         assert exact.norm().item() == pytest.approx(gradients[1][name].norm().item(), rel=0.1), name
 
 
+@pytest.mark.usefixtures("computes_bf16")
 def test_bfloat16_predicts_and_is_saved_in_float32(tmp_path: Any) -> None:
     model = make_model(precision="bf16").learn(40)
     model.save(tmp_path / "model")
@@ -96,6 +107,7 @@ def test_bfloat16_predicts_and_is_saved_in_float32(tmp_path: Any) -> None:
     assert_same(model.predict(observations, deterministic=True)[0], exact.predict(observations, deterministic=True)[0])
 
 
+@pytest.mark.usefixtures("computes_bf16")
 @pytest.mark.slow
 @pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-4), ("bf16", 0.05)])
 def test_compiled_losses_have_the_same_gradients(precision: str, tolerance: float, tmp_path: Any) -> None:
