@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from itertools import permutations
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -58,11 +58,12 @@ def improvements(runs: pd.DataFrame) -> pd.DataFrame:
     for checkpoint, part in runs.dropna(subset="mean").groupby("checkpoint"):
         returns = {key: group.to_numpy() for key, group in part.groupby(["variant", "environment"])["mean"]}
         tasks = {variant: set(group) for variant, group in part.groupby("variant")["environment"]}
-        for variant, over in permutations(part["variant"].unique(), 2):
+        for variant, over in combinations(part["variant"].unique(), 2):
             if common := sorted(tasks[variant] & tasks[over]):
                 samples = [returns[name, task] for name in (variant, over) for task in common]
-                interval = _interval(samples, _improvement)
-                rows.append((checkpoint, variant, over, len(common), _improvement(*samples), *interval))
+                probability, (low, high) = _improvement(*samples), _interval(samples, _improvement)
+                rows.append((checkpoint, variant, over, len(common), probability, low, high))
+                rows.append((checkpoint, over, variant, len(common), 1 - probability, 1 - high, 1 - low))
     return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high"])
 
 
@@ -71,13 +72,11 @@ def _iqm(*samples: np.ndarray, axis: int = -1) -> Any:
 
 
 def _improvement(*samples: np.ndarray, axis: int = -1) -> Any:
-    """Of the first half of the samples over the second: the mean of Mann and Whitney's U, as a share of all pairs."""
+    """Of the first half of the samples over the second: the share of all pairs that are better, averaged over the tasks."""
     half = len(samples) // 2
-    shares = []
-    for ours, others in zip(samples[:half], samples[half:], strict=True):
-        u = stats.mannwhitneyu(ours, others, axis=axis, method="asymptotic").statistic
-        shares.append(u / (ours.shape[axis] * others.shape[axis]))
-    return np.mean(shares, axis=0)
+    pairs = zip(samples[:half], samples[half:], strict=True)
+    signs = [np.sign(ours[..., :, None] - others[..., None, :]).mean(axis=(-2, -1)) for ours, others in pairs]
+    return (1 + np.mean(signs, axis=0)) / 2
 
 
 def _interval(samples: Sequence[np.ndarray], statistic: Any) -> tuple[float, float]:
