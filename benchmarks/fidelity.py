@@ -60,16 +60,20 @@ def study(scores: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    scores = returns(parser.parse_args().folder)
+def report(folder: Path) -> str:
+    """What is printed of a search."""
+    scores = returns(folder)
     table = study(scores)
-    print(f"{table.attrs['losses']} losses, seeds {sorted(set(scores.index.get_level_values('seed')))}")
-    print(table.round(2).to_string())
     by_seed = scores.mean(axis=1).unstack("seed")
-    print(by_seed.assign(mean=by_seed.mean(axis=1)).sort_values("mean").round(0).to_string())
+    lines = [
+        f"{table.attrs['losses']} losses, seeds {sorted(set(scores.index.get_level_values('seed')))}",
+        table.round(2).to_string(),
+        by_seed.assign(mean=by_seed.mean(axis=1)).sort_values("mean").round(0).to_string(),
+    ]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    print(report(parser.parse_args().folder))

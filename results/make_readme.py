@@ -6,18 +6,18 @@ its about.md, the first line being its title; numbers do not belong there.
 """
 
 import math
-import os
+import runpy
 import shlex
 import statistics
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from scipy.stats import mannwhitneyu
+from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import read_curve
+from search.cli.main import app
 from search.execution.matrix import comparable, stored_scores
 from search.execution.storage import STUDY_FILE, load_study, open_storage
 from search.results.analysis import analysed, trial_table
@@ -89,7 +89,7 @@ def benchmark_section(folder: Path, results: Path) -> Iterator[str]:
     :param results: Folder it is in
     """
     name = folder.relative_to(results.parent).as_posix()
-    yield from printed(f"aarl table {name}", results.parent)
+    yield from printed(f"aarl table {name}", results)
     abouts = read_abouts(folder)
     yield from paper(abouts.values())
     trained = [(path, about) for path, about in abouts.items() if (path / "curve.csv").exists()]
@@ -127,7 +127,9 @@ def search_section(folder: Path, results: Path) -> Iterator[str]:
     name = folder.relative_to(results.parent).as_posix()
     study = load_study(open_storage(folder, create=False))
     if len(study.user_attrs[SETTINGS_KEY]["seeds"]) > 1:
-        yield from printed(f"python benchmarks/fidelity.py {name}", results.parent)
+        report = runpy.run_path(str(results.parent / "benchmarks" / "fidelity.py"))["report"]
+        yield f"`python benchmarks/fidelity.py {name}`:\n"
+        yield from block(report(folder))
         return
     trials = analysed(trial_table(study.get_trials(deepcopy=False)))
     evolved, random = trials[trials["operation"].isin(EVOLVED)], trials[trials["operation"] == "random"]
@@ -148,14 +150,12 @@ def search_section(folder: Path, results: Path) -> Iterator[str]:
     for row in trials.nlargest(BEST, "score").to_dict("records"):
         yield f"| {row['number']} | {row['generation']} | {row['operation']} | {row['score']:.0f} | `{row['loss']}` |"
     yield ""
-    yield from printed(f"aarl analyze {name}", results.parent)
+    yield from printed(f"aarl analyze {name}", results)
     for part in ("baselines", "cross-validation"):
         runs = comparable(stored_scores(folder / part))
         if not runs.empty:
             yield f"{part.capitalize()}, AULC:\n"
-            yield "```text"
-            yield ranking(runs).round(1).to_string()
-            yield "```\n"
+            yield from block(ranking(runs).round(1).to_string())
 
 
 def summary(scores: list[float]) -> str:
@@ -181,20 +181,28 @@ def mean_of_best(scores: list[float], n: int) -> float:
     return sum(score * way for score, way in zip(sorted(scores), ways, strict=True)) / math.comb(len(scores), n)
 
 
-def printed(command: str, cwd: Path) -> Iterator[str]:
+def printed(command: str, results: Path) -> Iterator[str]:
     """
-    A command and what it prints.
+    A command of ``aarl`` and what it prints.
 
-    :param command: ``aarl ...`` or ``python ...``
-    :param cwd: Where it is run: beside results/
+    :param command: Its words, the last one a folder beside results/
+    :param results: This folder
     """
-    name, *arguments = command.split()
-    program = [sys.executable, *(["-m", "search.cli.main"] if name == "aarl" else []), *arguments]
-    environment = {**os.environ, "COLUMNS": "120", "NO_COLOR": "1"}
-    text = subprocess.run(program, env=environment, cwd=cwd, text=True, stdout=subprocess.PIPE, check=True).stdout
+    *words, folder = command.split()
+    runner = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"})
+    result = runner.invoke(app, [*words[1:], str(results.parent / folder)], catch_exceptions=False)
     yield f"`{command}`:\n"
+    yield from block(result.stdout)
+
+
+def block(text: str) -> Iterator[str]:
+    """
+    Text as it is.
+
+    :param text: Lines
+    """
     yield "```text"
-    yield "\n".join(line.rstrip() for line in text.strip().splitlines())
+    yield "\n".join(line.rstrip() for line in text.strip("\n").splitlines())
     yield "```\n"
 
 
