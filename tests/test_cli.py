@@ -1,34 +1,28 @@
 """The program: train, losses, search and matrices, as a user calls them."""
 
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
-from concurrent.futures import Future
 from configparser import ConfigParser
 from pathlib import Path
-from typing import Any
 
 import optuna
 import pytest
 import yaml
+from executors import Planted
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState, create_trial
-from program import aarl, start
-from tiny import SEARCH, write_search
+from tiny import SEARCH, YAML, write_search
 from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss, SACAux, catalog
-from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
+from sb3_aarl.callbacks import read_curve
 from search.cli.main import app
 from search.cli.options import read_config
 from search.evolution.space import distributions, loss_to_params
 from search.execution.storage import open_storage
-from search.training.run import Run
 from search.training.shipped import ZOO
 
 ROOT = Path(__file__).parent.parent
@@ -65,51 +59,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-class Executor:
-    """Runs that end at once: with a score for each loss, or a failure."""
-
-    def __init__(self, *arguments: Any):
-        self.arguments = arguments
-        self.scores: dict[str | None, float] = {}
-        self.fails: Any = lambda run: False
-        self.runs: list[Run] = []
-
-    def __call__(self, *arguments: Any) -> "Executor":
-        self.arguments = arguments
-        return self
-
-    def __enter__(self) -> "Executor":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        pass
-
-    def submit(self, fn: Any, path: str) -> "Future[Any]":
-        run = Run.model_validate_json((Path(path) / "run.json").read_text())
-        self.runs.append(run)
-        future: Future[Any] = Future()
-        if self.fails(run):
-            future.set_result({"curve": [], "failure": "it burst", "retry": False})
-            return future
-        score = self.scores.get(run.aux_loss, 1.0) + run.seed
-        curve = [
-            Evaluation(steps, score + side, 0.5, 1, 1.0) for steps, side in zip(run.checkpoints, (-1.0, 1.0), strict=True)
-        ]
-        write_curve(Path(path) / "curve.csv", curve)
-        future.set_result({"curve": [list(point) for point in curve], "failure": None, "retry": False})
-        return future
-
-
-@pytest.fixture
-def executor(monkeypatch: pytest.MonkeyPatch) -> Executor:
-    """In the place of this machine's processes, and of Ray's."""
-    executor = Executor()
-    monkeypatch.setattr("search.execution.runs.LocalExecutor", executor)
-    monkeypatch.setattr("search.execution.matrix.POLL_SECONDS", 0)
-    monkeypatch.setattr("search.execution.driver.POLL_SECONDS", 0)
-    return executor
-
-
 def run(*arguments: object, code: int = 0) -> str:
     """What the program prints, which must end with an exit code; errors are one line."""
     result = runner.invoke(app, [str(argument) for argument in arguments])
@@ -119,30 +68,28 @@ def run(*arguments: object, code: int = 0) -> str:
     return result.output
 
 
-@pytest.mark.slow
 def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
-    write_search(folder)
-    # As without the extra "search".
-    program = "import sys; sys.modules |= dict.fromkeys(['optuna', 'pandas', 'sklearn']); "
-    program += "from search.cli.main import main; main()"
-    options = "--aux-loss {s_t}->{r_t,s_t+1} --config hyperparameters.yml --steps 400 --evaluations 2 --episodes 1 --seed 4"
-    command = [sys.executable, "-c", program, "train", "Pendulum-v1", *options.split(), "--folder", "here"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", "TERM": "dumb"}
-    result = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert result.returncode == 0, result.stderr
-    curve = read_curve(Path("here/curve.csv"))
-    assert [point.environment_steps for point in curve] == [200, 400]
+    (folder / "own.yml").write_text(YAML + "  n_timesteps: 205\n")
+    (folder / "winner.yml").write_text(yaml.safe_dump({"aux_loss": LOSSES[0]}))
+    options = "--aux-loss winner.yml --config own.yml --evaluations 2 --episodes 1"
+    arguments = ["train", "Pendulum-v1", *options.split(), "--seed", "4"]
+    shown = run(*arguments)
+    (path,) = Path("runs").iterdir()
+    assert path.name.startswith("pendulum-v1-winner-yml-")
+    curve = read_curve(path / "curve.csv")
+    assert [point.environment_steps for point in curve] == [102, 204]
     for point in curve:
-        assert re.search(rf"{point.environment_steps:,}\D+{abs(point.mean):.1f}\D+{point.std:.1f}", result.stdout)
-    assert f"(AULC) {(curve[0].mean + curve[1].mean) / 2:.1f}" in result.stdout
-    assert "here/model.zip" in result.stdout and "here/curve.csv" in result.stdout
-    model = SACAux.load("here/model.zip")
-    assert model.aux_loss == AuxLoss.parse("{s_t} -> {r_t, s_t+1}")
-    assert (model.seed, model.num_timesteps, model.batch_size) == (4, 400, 8)
-    run("train", "Pendulum-v1", *options.split(), "--folder", "here")
-    assert read_curve(Path("here/curve.csv")) == curve  # it is not trained again
-    other = run("train", "Pendulum-v1", *options.replace("--seed 4", "--seed 5").split(), "--folder", "here", code=2)
-    assert "here" in other and "seed" in other
+        assert re.search(rf"{point.environment_steps:,}\D+{abs(point.mean):.1f}\D+{point.std:.1f}", shown)
+    assert f"(AULC) {(curve[0].mean + curve[1].mean) / 2:.1f}" in shown
+    assert f"{path}/model.zip" in shown and f"{path}/curve.csv" in shown
+    model = SACAux.load(path / "model.zip")
+    assert model.aux_loss == LOSSES[0] and (model.seed, model.num_timesteps, model.batch_size) == (4, 204, 8)
+    about = json.loads((path / "provenance.json").read_text())
+    assert about["sessions"][0]["aux_loss"] == str(LOSSES[0]) and about["seconds"] > 0
+    run(*arguments, "--folder", path)
+    assert read_curve(path / "curve.csv") == curve  # it is not trained again
+    assert f"{path} has another run: seed is 4 there, 5 here" in run(*arguments, "--seed", 5, "--folder", path, code=2)
+    assert f"{path} has another run: aux_loss is" in run(*arguments, "--aux-loss", "none", "--folder", path, code=2)
 
 
 @pytest.mark.parametrize(
@@ -152,11 +99,12 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
         (["own_env:Own-v0"], "'own_env' as one of the imports"),
         (["Pendulum-v1", "--aux-loss", "curll"], "nearest: curl"),
         (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "'q_t' is no token"),
+        (["Pendulum-v1"], "how many steps"),
         (["Pendulum-v1", "--steps", "3", "--evaluations", "5"], "too few"),
         (["Pendulum-v1", "--config", "simba/sac_simbaa"], "nearest: simba/sac_simba"),
         (["CartPole-v1", "--steps", "1000"], "CartPole-v1 cannot be trained"),
     ],
-    ids=["environment", "module", "name", "notation", "steps", "file", "actions"],
+    ids=["environment", "module", "name", "notation", "no steps", "steps", "file", "actions"],
 )
 def test_errors_of_train_are_one_line(arguments: list[str], message: str, folder: Path) -> None:
     write_search(folder)
@@ -240,7 +188,7 @@ def test_a_search_warns_of_horizons_that_no_episode_has(folder: Path, caplog: py
     assert "max_horizon is 300 environment steps, episodes have 200" in caplog.text
 
 
-def test_a_folder_is_that_of_one_search(folder: Path, executor: Executor) -> None:
+def test_a_folder_is_that_of_one_search(folder: Path, executor: Planted) -> None:
     write_search(folder, SMALLER + "cross_validation: {environments: [Pendulum-v1]}\n")
     output = run("search", "small.yml", "--generations", 1, "--folder", "mine")
     assert output.endswith(" small.yml --folder mine\n")
@@ -256,7 +204,7 @@ def test_errors_have_no_password(folder: Path) -> None:
     assert "127.0.0.1" in error and "s3cret" not in error
 
 
-def test_a_missing_extra_is_named(folder: Path, executor: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_extra_is_named(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder)
     monkeypatch.delitem(sys.modules, "search.execution.ray", raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
@@ -264,7 +212,7 @@ def test_a_missing_extra_is_named(folder: Path, executor: Executor, monkeypatch:
 
 
 @pytest.mark.slow
-def test_search_reports_progress_and_resumes(folder: Path, executor: Executor) -> None:
+def test_search_reports_progress_and_resumes(folder: Path, executor: Planted) -> None:
     write_search(folder, SMALLER)
     output = run("search", "small.yml", "--generations", 1, "--threads", 2, "--workers", 3)
     assert executor.arguments == (3,) and {run.threads for run in executor.runs} == {2}
@@ -274,10 +222,13 @@ def test_search_reports_progress_and_resumes(folder: Path, executor: Executor) -
     assert "generation 1: 2/2 done" in output and "generation 2: 2/2 done" in output and len(executor.runs) == 4
     study = optuna.load_study(study_name="small", storage=open_storage(Path("runs/small")))
     assert [trial.state for trial in study.trials] == [TrialState.COMPLETE] * 4
+    run("report", "small.yml")
+    notation = str(AuxLoss.parse(study.best_trial.user_attrs["loss"]))
+    assert notation.replace(">", "&gt;") in Path("runs/small/report.html").read_text()
 
 
 @pytest.mark.slow
-def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray")
     write_search(folder, SMALLER)
     monkeypatch.setattr("search.execution.ray.RayExecutor", executor)
@@ -287,7 +238,7 @@ def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Executor, mon
 
 
 @pytest.mark.slow
-def test_a_search_in_which_all_fails_is_exit_code_1(folder: Path, executor: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_in_which_all_fails_is_exit_code_1(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder, SMALLER)
     monkeypatch.setattr("search.execution.driver.MAX_FAILURES", 2)
     executor.fails = lambda run: True
@@ -305,7 +256,7 @@ def searched(folder: Path) -> optuna.Study:
     return study
 
 
-def test_cross_validation_ranks_what_is_complete(searched: optuna.Study, executor: Executor) -> None:
+def test_cross_validation_ranks_what_is_complete(searched: optuna.Study, executor: Planted) -> None:
     worst, middle, best = map(str, LOSSES)
     executor.scores = {worst: 1.0, middle: 2.0, best: 3.0}
     executor.fails = lambda run: run.aux_loss == best and run.environment != "Pendulum-v1" and run.seed == 2
@@ -321,7 +272,7 @@ def test_cross_validation_ranks_what_is_complete(searched: optuna.Study, executo
     assert f"Winner: {best}" in run("cross-validate", "small.yml", "--top", 1) and len(executor.runs) == n_runs + 1
 
 
-def test_a_cross_validation_with_baselines(searched: optuna.Study, executor: Executor) -> None:
+def test_a_cross_validation_with_baselines(searched: optuna.Study, executor: Planted) -> None:
     executor.scores = {str(loss): float(score) for score, loss in enumerate(LOSSES)} | {None: 9.0}
     output = run("cross-validate", "small.yml", "--baselines")
     # The best row is a baseline, the winner the best candidate.
@@ -334,14 +285,14 @@ def test_a_cross_validation_with_baselines(searched: optuna.Study, executor: Exe
     assert "CURL" in Path("runs/small/report.html").read_text().partition("Cross-validation")[2]
 
 
-def test_an_environment_on_which_all_fail_is_no_reason_not_to_rank(searched: optuna.Study, executor: Executor) -> None:
+def test_an_environment_on_which_all_fail_is_no_reason_not_to_rank(searched: optuna.Study, executor: Planted) -> None:
     executor.scores = {str(loss): float(score) for score, loss in enumerate(LOSSES)}
     executor.fails = lambda run: run.environment != "Pendulum-v1"
     output = run("cross-validate", "small.yml", code=1)
     assert f"Winner: {LOSSES[-1]}" in output and output.count("Failed: ") == 6
 
 
-def test_a_cross_validation_without_any_run_has_no_winner(searched: optuna.Study, executor: Executor) -> None:
+def test_a_cross_validation_without_any_run_has_no_winner(searched: optuna.Study, executor: Planted) -> None:
     executor.fails = lambda run: True
     output = run("cross-validate", "small.yml", code=1)
     assert "Winner" not in output and output.count("Failed: ") == 12 and not Path("runs/small/winner.yml").exists()
@@ -354,7 +305,7 @@ def test_cross_validation_needs_a_search(searched: optuna.Study) -> None:
     assert not Path("elsewhere").exists()
 
 
-def test_baselines_and_operators(folder: Path, executor: Executor) -> None:
+def test_baselines_and_operators(folder: Path, executor: Planted) -> None:
     write_search(folder, MATRICES)
     executor.fails = lambda run: run.aux_loss is not None and "[" in run.aux_loss and run.seed == 1
     output = run("baselines", "small.yml", code=1)
@@ -368,7 +319,7 @@ def test_baselines_and_operators(folder: Path, executor: Executor) -> None:
     assert "mse, w/o negative samples" in first and "1.000" in first and output.count("negative samples") == 10
 
 
-def test_a_benchmark_grows_and_names_what_failed(folder: Path, executor: Executor) -> None:
+def test_a_benchmark_grows_and_names_what_failed(folder: Path, executor: Planted) -> None:
     write_search(folder)
     for name in ("a", "b"):
         Path(f"{name}.yml").write_text(Path("hyperparameters.yml").read_text())
@@ -380,25 +331,3 @@ def test_a_benchmark_grows_and_names_what_failed(folder: Path, executor: Executo
     assert json.loads(run("table", "bench", "--json"))
     assert "evaluations" in run("benchmark", *options.replace("200,400", "100,400").split(), "--seeds", "0", code=2)
     assert "--every" in run("benchmark", *options.split(), "--every", "20k,30k", code=2)
-
-
-@pytest.mark.slow
-def test_a_search_for_real(folder: Path) -> None:
-    """SIGTERM, as clusters send it, the same command again, and a report."""
-    config = write_search(folder, SMALLER)
-    process = start("search", config, "--generations", 1, folder=folder)
-    while not list(Path("runs").rglob("checkpoint*")) and process.poll() is None:
-        time.sleep(0.1)
-    process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate(timeout=60)
-    assert process.returncode == 130 and output.endswith(
-        "Interrupted. The same command resumes it, each run from its last evaluation.\n"
-    ), output
-    (trial,) = optuna.load_study(study_name="small", storage=open_storage(Path("runs/small"))).trials
-    assert trial.state == TrialState.FAIL and trial.user_attrs["interrupted"]
-    output = aarl("search", config, "--generations", 1, "--workers", 2, folder=folder)
-    assert "generation 1: 2/2 done" in output.splitlines()[-2]
-    run("report", config)
-    study = optuna.load_study(study_name="small", storage=open_storage(Path("runs/small")))
-    notation = str(AuxLoss.parse(study.best_trial.user_attrs["loss"]))
-    assert notation.replace(">", "&gt;") in Path("runs/small/report.html").read_text()

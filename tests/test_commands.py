@@ -9,6 +9,7 @@ import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+from executors import Planted
 from filelock import FileLock
 from tiny import HYPERPARAMETERS, SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
@@ -80,6 +81,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the program runs."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("search.studies.cost.MEASURED_SECONDS", 0.2)
     return tmp_path
 
 
@@ -181,10 +183,9 @@ def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path) -> None:
     assert not Path("runs").exists()
 
 
-@pytest.mark.slow
-def test_a_benchmark_costs_what_is_not_finished(folder: Path) -> None:
+def test_a_benchmark_costs_what_is_not_finished(folder: Path, executor: Planted) -> None:
     write_search(folder)
-    options = ["hyperparameters.yml", "--envs", "Pendulum-v1", "--checkpoints", "200", "--episodes", "1", "--folder", "bench"]
+    options = ["hyperparameters.yml", "--envs", "Pendulum-v1", "--checkpoints", "100,200", "--folder", "bench"]
     assert "All: 3 runs" in run("benchmark", *options, "--seeds", "0-2", "--dry-run")
     assert not Path("bench").exists()
     run("benchmark", *options, "--seeds", "0")
@@ -192,9 +193,9 @@ def test_a_benchmark_costs_what_is_not_finished(folder: Path) -> None:
     assert "All runs are finished" in run("benchmark", *options, "--seeds", "0", "--dry-run")
 
 
-@pytest.mark.slow
-def test_status_of_a_search_and_its_baselines(folder: Path) -> None:
+def test_status_of_a_search_and_its_baselines(folder: Path, executor: Planted) -> None:
     write_search(folder, BASELINES)
+    executor.scores = {None: 3.0}
     run("search", "small.yml", "--generations", 1, "--workers", 2)
     shown, data = run("status", "small.yml"), json.loads(run("status", "runs/small", "--json"))
     assert re.search(r"generation 1 +│ +3 │ +3 │ +0 │ +0 │", shown)

@@ -1,6 +1,7 @@
 """The driver: the same losses and scores however many runs are in flight, however they end, and after interruptions."""
 
 import random
+import sqlite3
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import optuna
 import pytest
 from optuna.pruners import ThresholdPruner
-from optuna.storages import InMemoryStorage
+from optuna.storages import BaseStorage, InMemoryStorage
 from optuna.trial import TrialState
 
 from sb3_aarl import AuxLoss
@@ -18,6 +19,7 @@ from search.evolution.space import loss_of, loss_to_params, suggest_aux_loss
 from search.execution import driver
 from search.execution.driver import Driver
 from search.execution.runs import RunFailed
+from search.execution.storage import open_storage
 from search.training.run import Run
 
 CHECKPOINTS = (100, 200, 300)
@@ -67,7 +69,7 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "POLL_SECONDS", 0)
 
 
-STORAGES: dict[Path, InMemoryStorage] = {}
+STORAGES: dict[Path, BaseStorage] = {}
 
 
 def start(folder: Path, executor: Executor, workers: int = 1, **kwargs: Any) -> Driver:
@@ -135,6 +137,18 @@ def test_a_trial_left_running_is_interrupted_and_its_slot_has_the_same_loss(tmp_
     assert (first.state, first.user_attrs["interrupted"]) == (TrialState.FAIL, True)
     assert loss_of(again) == loss
     assert [again.user_attrs[key] for key in ("generation", "slot", "attempt")] == [1, 0, 0]
+
+
+def test_an_interrupted_query_does_not_lock_the_study(tmp_path: Path) -> None:
+    def interrupt(trial: optuna.Trial) -> None:
+        cursor = sqlite3.connect(tmp_path / "study.db").execute("SELECT * FROM trials")
+        raise KeyboardInterrupt(cursor.description)
+
+    STORAGES[tmp_path] = open_storage(tmp_path)
+    search = start(tmp_path, Executor(), on_change=interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        list(search)
+    assert [trial.state for trial in search.study.trials] == [TrialState.FAIL]
 
 
 def test_a_second_driver_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,11 +12,14 @@ from typing import Any
 import optuna
 import psutil
 import pytest
+from executors import InProcess
 from optuna.trial import TrialState
 from postgres import Postgres
 from program import aarl, start
 from tiny import SEARCH, write_search
+from typer.testing import CliRunner
 
+from search.cli.main import app
 from search.evolution.space import loss_of
 from search.execution.driver import Driver
 from search.execution.storage import open_storage
@@ -23,6 +27,8 @@ from search.studies.config import load_config
 from search.studies.search import open_search, runs_of
 
 pytestmark = pytest.mark.slow
+# A generation of random losses and a prior, and one with a crossover and a mutation.
+SHORT = SEARCH.replace("[200, 400]", "[100, 200]")
 Slots = dict[tuple[int, int], tuple[str, float | None]]
 
 
@@ -37,8 +43,12 @@ def slots(folder: Path | None, url: str | None = None) -> Slots:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Slots:
+    """Without processes, one run after the other."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    aarl("search", write_search(folder), "--workers", 2, folder=folder)
+    config, storage = load_config(write_search(folder, SHORT)), open_storage(folder / "runs/small")
+    study, _ = open_search(config, storage)
+    for _ in Driver(study, storage, runs_of(config), InProcess(), folder / "runs/small"):
+        pass
     found = slots(folder)
     assert len(found) == 6
     return found
@@ -49,26 +59,45 @@ def runs_of_driver(pid: int) -> list[int]:
     return [process.pid for process in psutil.Process(pid).children() if "search.training.run" in process.cmdline()]
 
 
-def test_runs_and_driver_are_killed_and_interrupted(tmp_path: Path, undisturbed: Slots) -> None:
+def refused(*arguments: object) -> str:
+    """The error of the program, in this process."""
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 2
+    return result.stderr
+
+
+def test_runs_and_driver_are_killed_and_interrupted(
+    tmp_path: Path, undisturbed: Slots, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The same command ends with the same losses and scores."""
-    config, candidates = write_search(tmp_path), tmp_path / "runs/small/candidates"
+    monkeypatch.chdir(tmp_path)
+    config, candidates = write_search(tmp_path, SHORT), tmp_path / "runs/small/candidates"
+    process = start("search", config, "--workers", 2, folder=tmp_path)
+    wait_until(lambda: len(runs_of_driver(process.pid)) == 2, process)
+    process.send_signal(signal.SIGTERM)  # as clusters send it
+    output, _ = process.communicate(timeout=60)
+    last = "Interrupted. The same command resumes it, each run from its last evaluation.\n"
+    assert process.returncode == 130 and output.endswith(last), output
+    assert all(trial.state == TrialState.FAIL and trial.user_attrs["interrupted"] for trial in load(tmp_path).trials)
+
     process = start("search", config, "--workers", 2, folder=tmp_path)
     wait_until(lambda: any(candidates.glob("generation-1/slot-001/*/*/provenance.json")), process)
+    wait_until(lambda: len(runs_of_driver(process.pid)) == 2, process)
     for pid in runs_of_driver(process.pid):
         os.kill(pid, signal.SIGKILL)
     wait_until(lambda: any(candidates.glob("generation-1/slot-001/*/*/curve.csv")), process)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
-    assert process.returncode == 130 and "resumes" in output
+    assert process.returncode == 130 and output.endswith(last), output
     assert TrialState.RUNNING not in [trial.state for trial in load(tmp_path).trials]
 
-    process = start("search", config, "--workers", 1, folder=tmp_path)
+    process = start("search", config, "--workers", 2, folder=tmp_path)
     wait_until(lambda: any(candidates.glob("generation-2/slot-000/*/*/provenance.json")), process)
-    second = start("search", config, folder=tmp_path)
-    assert second.wait(60) == 2 and "another program" in second.communicate()[0]
+    assert "another program" in refused("search", config)
     left = runs_of_driver(process.pid)
     process.kill()
     process.communicate()
+    assert left
     deadline = time.monotonic() + 60  # a run that has just started has its imports to make first
     while any(psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE for pid in left):
         assert time.monotonic() < deadline, "runs outlive their driver"
@@ -76,22 +105,29 @@ def test_runs_and_driver_are_killed_and_interrupted(tmp_path: Path, undisturbed:
 
     aarl("search", config, "--workers", 2, folder=tmp_path)
     assert slots(tmp_path) == undisturbed
-    write_search(tmp_path, SEARCH.replace("population_size: 3", "population_size: 5"))
-    other = start("search", config, folder=tmp_path)
-    assert other.wait(60) == 2 and "population_size" in other.communicate()[0]
+    write_search(tmp_path, SHORT.replace("population_size: 3", "population_size: 5"))
+    assert "population_size" in refused("search", config)
 
 
-def test_postgresql_restarts_in_the_middle(tmp_path: Path, undisturbed: Slots, postgres: Postgres) -> None:
+def test_postgresql_restarts_in_the_middle(
+    tmp_path: Path, undisturbed: Slots, postgres: Postgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Restarting(InProcess):
+        runs = 0
+
+        def submit(self, fn: Any, path: str) -> Any:
+            self.runs += 1
+            if self.runs == 2:
+                postgres.stop(crash=True)
+                threading.Timer(6, postgres.start).start()
+            return super().submit(fn, path)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("search.execution.runs.LocalExecutor", lambda workers: Restarting())
     url = postgres.create("restarted")
-    process = start("search", write_search(tmp_path), "--workers", 2, "--storage", url, folder=tmp_path)
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "runs/small/candidates/generation-1/slot-001").exists():
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.2)
-    postgres.restart(crash=True, seconds=3)
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-    assert "s3cret" not in output
+    result = CliRunner().invoke(app, ["search", str(write_search(tmp_path, SHORT)), "--storage", url])
+    assert result.exit_code == 0, result.output
+    assert "s3cret" not in result.output
     assert slots(None, url) == undisturbed
 
 
@@ -113,7 +149,8 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 def test_a_ray_node_is_removed(tmp_path: Path, undisturbed: Slots, cluster: Any) -> None:
     from search.execution.ray import RayExecutor
 
-    config, folder = load_config(write_search(tmp_path)), tmp_path / "runs/small"
+    config, folder = load_config(write_search(tmp_path, SHORT)), tmp_path / "runs/small"
+    config = config.model_copy(update={"generations": 1})
     storage = open_storage(folder)
     study, _ = open_search(config, storage)
     removed = False
@@ -123,7 +160,7 @@ def test_a_ray_node_is_removed(tmp_path: Path, undisturbed: Slots, cluster: Any)
                 cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
                 removed = True
     assert removed
-    assert slots(tmp_path) == undisturbed
+    assert slots(tmp_path) == {slot: found for slot, found in undisturbed.items() if slot[0] == 1}
 
 
 def load(folder: Path) -> optuna.Study:

@@ -1,6 +1,5 @@
 """The paper's procedures: the study of a search, its runs, baselines, cross-validation, operators; one run by hand."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,24 +7,20 @@ import numpy as np
 import optuna
 import pandas as pd
 import pytest
-import yaml
 from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import InMemoryStorage
 from optuna.trial import create_trial
 from sklearn.linear_model import BayesianRidge
-from tiny import SEARCH, YAML, write_search
+from tiny import SEARCH, write_search
 
-from sb3_aarl import AuxLoss, SACAux, catalog
-from sb3_aarl.callbacks import read_curve
+from sb3_aarl import AuxLoss, catalog
 from search.evolution.space import distributions, loss_to_params, random_loss
 from search.evolution.surrogate import features
 from search.execution.matrix import Cell
 from search.studies import cross_validation, operator_selection
 from search.studies.config import SearchConfig, load_config
 from search.studies.search import SETTINGS_KEY, baselines, make_pruner, open_search, runs_of
-from search.studies.single import prepare_one
 from search.training.config import ConfigError
-from search.training.run import train
 
 PARTS = """\
 cross_validation:
@@ -210,47 +205,3 @@ def test_normalized_returns_rank_the_higher_one_first(
     assert list(table.index) == list(expected)
     for variant, numbers in expected.items():
         assert tuple(table.loc[variant, ["mean", "std"]]) == pytest.approx(numbers)
-
-
-# One run by hand.
-
-
-@pytest.mark.slow
-def test_one_run_keeps_its_model_and_is_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("own.yml").write_text(YAML + "  n_timesteps: 205\n")
-    Path("winner.yml").write_text(yaml.safe_dump({"aux_loss": LOSSES[0]}))
-    arguments: dict[str, Any] = {"environment": "Pendulum-v1", "config": "own.yml", "evaluation_episodes": 1, "seed": 3}
-    folder = prepare_one(aux_loss="winner.yml", n_evaluations=2, **arguments)
-    curve = train(folder)
-    assert folder.parent == Path("runs") and folder.name.startswith("pendulum-v1-winner-yml-")
-    assert [point.environment_steps for point in curve] == [102, 204] and curve == read_curve(folder / "curve.csv")
-    model = SACAux.load(folder / "model.zip")
-    assert model.num_timesteps == 204 and model.aux_loss == LOSSES[0]
-    about = json.loads((folder / "provenance.json").read_text())
-    assert about["sessions"][0]["aux_loss"] == str(LOSSES[0]) and about["seconds"] > 0
-    # The seconds of the curve too.
-    assert prepare_one(aux_loss=str(LOSSES[0]), n_evaluations=2, folder=folder, **arguments) == folder
-    assert train(folder) == curve
-    with pytest.raises(ValueError, match=f"{folder} has another run: aux_loss is"):
-        prepare_one(aux_loss="none", n_evaluations=2, folder=folder, **arguments)
-
-
-@pytest.mark.parametrize(
-    ("text", "changed", "message"),
-    [
-        ("", {}, "how many steps"),
-        ("  n_timesteps: 4\n", {}, "too few"),
-        ("", {"environment": "Pendulm-v1"}, "nearest: Pendulum-v1"),
-        ("", {"environment": "CartPole-v1", "environment_steps": 100}, "CartPole-v1 cannot be trained"),
-        ("", {"aux_loss": "crul"}, "curl"),
-    ],
-)
-def test_what_cannot_be_trained_leaves_no_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, changed: dict[str, Any], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("own.yml").write_text(YAML + text)
-    with pytest.raises(ValueError, match=message):
-        prepare_one(**{"environment": "Pendulum-v1", "aux_loss": None, "config": "own.yml", **changed})
-    assert not Path("runs").exists()

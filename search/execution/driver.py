@@ -2,6 +2,7 @@
 
 import logging
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,6 +126,9 @@ class Driver:
                 if not self.running and self._patiently(self.sampler.is_complete, self.study):
                     return
                 time.sleep(POLL_SECONDS)
+        except KeyboardInterrupt as interrupt:
+            traceback.clear_frames(interrupt.__traceback__)  # of a query that it ended: its cursor would lock SQLite
+            raise
         finally:
             self.running.clear()
             self._interrupt_unknown()  # those that ran, and the one of an ask that was interrupted
