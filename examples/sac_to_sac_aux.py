@@ -25,7 +25,7 @@ def main(steps: int) -> None:
         evaluation = EvalCallback(
             Monitor(gym.make("Pendulum-v1")),
             n_eval_episodes=10,
-            eval_freq=max(1, steps // 5),
+            eval_freq=min(1_000, steps),
             best_model_save_path=f"runs/examples/{algorithm.__name__}",
         )
         model = algorithm("MlpPolicy", "Pendulum-v1", seed=0)

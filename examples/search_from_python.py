@@ -1,7 +1,7 @@
 """
 A search for losses on an environment of one's own, from Python, with an executor of one's own.
 
-One sees which runs start, how far each generation is, and the best loss: six runs, one to two minutes on two cores. Scores of
+One sees which runs start, how far each generation is, and the best loss: four runs, one to two minutes on two cores. Scores of
 so short runs mean little. The same command resumes the search; `aarl dashboard runs/examples/search` shows it.
 
     python examples/search_from_python.py
@@ -41,7 +41,7 @@ def main(steps: int) -> None:
         return [Run(aux_loss=str(loss), seed=0, checkpoints=checkpoints, evaluation_episodes=3, **settings)]
 
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # where runs, processes of their own, find this file
-    sampler = AuxLossSampler(population_size=3, n_random=2, n_prior=1, n_generations=2, seed=0)
+    sampler = AuxLossSampler(population_size=2, n_random=2, n_prior=0, n_generations=2, seed=0)
     storage = open_storage(FOLDER)
     study = optuna.create_study(study_name="mars", storage=storage, sampler=sampler, direction="maximize", load_if_exists=True)
     with Announcing(workers=2) as executor:

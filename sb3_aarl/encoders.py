@@ -14,16 +14,6 @@ from sb3_aarl.augmentation import image_spaces
 from sb3_aarl.networks import SimbaBlock, orthogonal_init
 
 
-def flat(observations: th.Tensor) -> th.Tensor:
-    """
-    Observations as vectors, scalars too.
-
-    :param observations: (batch, ...)
-    :return: (batch, numbers of an observation)
-    """
-    return observations.unsqueeze(-1).flatten(start_dim=1)
-
-
 class Encoder(BaseFeaturesExtractor, ABC):
     """
     An encoder in two parts: a trunk, and a projection (linear, layer norm) from it to the latent state.
@@ -130,7 +120,7 @@ class DenseMLP(Encoder):
         self.projection = self.make_projection()
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        x = flat(observations)
+        x = observations.reshape(len(observations), -1)
         for layer in self.layers:
             added = layer(x).relu()
             x = th.cat([x, added], dim=1) if self.dense else added
@@ -198,7 +188,7 @@ class SimbaEncoder(Encoder):
         self.projection = nn.Sequential()
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        return self.layers(self.normalization(flat(observations)))
+        return self.layers(self.normalization(observations.reshape(len(observations), -1)))
 
 
 VECTOR_ENCODERS: Mapping[str, type[DenseMLP] | type[SimbaEncoder]] = {
@@ -231,21 +221,19 @@ class MultiInputEncoder(Encoder):
     ):
         images = image_spaces(observation_space, normalized_image)
         vectors = {key: space for key, space in observation_space.spaces.items() if key not in images}
-        encoders: dict[str, Encoder] = {key: PixelEncoder(space, cnn_output_dim) for key, space in images.items()}
+        encoders: list[Encoder] = [PixelEncoder(space, cnn_output_dim) for space in images.values()]
         if vectors:
-            encoders["vectors"] = VECTOR_ENCODERS[vector_encoder](spaces.Dict(vectors), mlp_output_dim)
-        super().__init__(
-            observation_space,
-            sum(encoder.features_dim for encoder in encoders.values()),
-            sum(encoder.trunk_dim for encoder in encoders.values()),
-        )
+            encoders.append(VECTOR_ENCODERS[vector_encoder](spaces.Dict(vectors), mlp_output_dim))
+        features_dim, trunk_dim = (sum(getattr(part, name) for part in encoders) for name in ("features_dim", "trunk_dim"))
+        super().__init__(observation_space, features_dim, trunk_dim)
         self.image_keys, self.vector_keys = list(images), list(vectors)
-        self.encoders = nn.ModuleList(encoders.values())
+        self.encoders = nn.ModuleList(encoders)
 
     def _inputs(self, observations: TensorDict) -> list[th.Tensor]:
         inputs = [observations[key] for key in self.image_keys]
         if self.vector_keys:
-            inputs.append(th.cat([flat(observations[key]) for key in self.vector_keys], dim=1))
+            parts = (observations[key] for key in self.vector_keys)
+            inputs.append(th.cat([part.reshape(len(part), -1) for part in parts], dim=1))
         return inputs
 
     def trunk(self, observations: TensorDict) -> th.Tensor:  # type: ignore[override]

@@ -3,14 +3,15 @@
 import json
 import re
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from tiny import YAML
 
-from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
-from search.execution.matrix import Cell, cell_folder, run_matrix
+from sb3_aarl.callbacks import Evaluation, aulc, read_curve, write_curve
+from search.execution.matrix import Cell, cell_folder, comparable, run_matrix, scores
 from search.execution.runs import LocalExecutor
 from search.results import table
 from search.studies import benchmark
@@ -175,6 +176,8 @@ def test_runs_that_were_copied_together_are_compared_only_if_trained_alike(folde
 def test_runs_are_those_without_a_benchmark_and_what_fails_does_not_hide_the_others(folder: Path) -> None:
     (folder / "bursts.yml").write_text(OWN.replace("learning_starts: 40", "learning_starts: 5\n  learning_rate: 1.0e+30"))
     matrix = load("mine.yml bursts.yml", seeds=[3], checkpoints=[80], every=40, evaluation_episodes=1)
+    if sys.version_info >= (3, 11):  # before, Python has the working directory first in its path
+        (folder / "search.py").write_text("raise SystemExit('another one')")
     with LocalExecutor(2) as executor:
         (*_, last) = run_matrix(matrix, executor, workers=2)
     assert (last.finished, last.failed) == (1, 1)
@@ -190,6 +193,8 @@ def test_runs_are_those_without_a_benchmark_and_what_fails_does_not_hide_the_oth
     curve = train(folder / "alone")
     path = cell_folder(Path("out"), mine)
     assert [point[:4] for point in read_curve(path / "curve.csv")] == [point[:4] for point in curve]
+    (row,) = comparable(scores(matrix)).to_dict("records")
+    assert row["variant"] == "mine" and (row["last"], row["score"]) == (curve[-1].mean, pytest.approx(aulc(curve)))
     about = json.loads((path / ABOUT).read_text())
     assert {key: about[key] for key in matrix.abouts[mine]} == matrix.abouts[mine]
     assert about["seconds"] > 0 and about["hyperparameters"] == load_hyperparameters(about["file"], ENV)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -219,6 +220,9 @@ def test_status_of_a_benchmark(folder: Path) -> None:
         shown = run("status", "bench")
     assert re.search(r"some +│ +3 │ +1 │ +1 │ +1 │ +-\d+\.\d\d │", shown)
     assert re.search(r"Benchmark: 0:00:\d\d to go", shown)
+    shutil.copy("bench/some/Pendulum-v1/seed-1/failed.json", "bench/some/Pendulum-v1/seed-2")
+    shutil.rmtree("bench/some/Pendulum-v1/seed-0")
+    assert "Benchmark: finished" in run("status", "bench")
     assert "neither" in run("status", "nowhere", code=2)
 
 

@@ -46,8 +46,8 @@ def test_every_block_is_of_a_known_language() -> None:
 @pytest.mark.parametrize("page", [page for page in PAGES if any(name == "python" for name, _ in blocks(page))])
 def test_python_runs(page: str, tmp_path: Path) -> None:
     """The blocks of a page, one after the other, in a folder with a small search."""
-    text = re.sub(r"(generations|n_random|population_size): \d", r"\1: 1", SEARCH)
-    write_search(tmp_path, f"{text}baselines: [{{name: SAC}}]\n")
+    text = re.sub(r"(generations|n_random|population_size): \d", r"\1: 1", SEARCH).replace("n_prior: 1", "n_prior: 0")
+    write_search(tmp_path, f"{text.replace('200, 400', '100, 200')}baselines: [{{name: SAC}}]\n")
     code = "\n".join(text for name, text in blocks(page) if name == "python")
     for pattern, replacement in SHORTER.items():
         code = re.sub(pattern, replacement, code, flags=re.MULTILINE)

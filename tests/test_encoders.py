@@ -8,20 +8,18 @@ import torch as th
 from gymnasium import spaces
 from scipy.signal import correlate
 from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 from torch.nn import functional as F
 
 from sb3_aarl import SACAux
 from sb3_aarl.encoders import (
-    ENCODERS,
     MLP,
     DenseMLP,
     MultiInputEncoder,
     PixelEncoder,
     RunningNorm,
     SimbaEncoder,
-    encoder_class,
 )
 
 
@@ -147,7 +145,7 @@ def test_mlps_against_a_naive_forward_pass(cls: type[DenseMLP], shape: tuple[int
 
 @pytest.mark.parametrize(
     "keys",
-    [["camera", "wrist", "speed", "mode", "joints"], ["camera"], ["speed", "joints"]],
+    [["camera", "vectors", "speed", "mode", "joints"], ["camera"], ["speed", "joints"]],
     ids=["both", "images only", "vectors only"],
 )
 @pytest.mark.parametrize(("name", "vector_encoder"), [("dense_mlp", DenseMLP), ("simba", SimbaEncoder)])
@@ -158,7 +156,7 @@ def test_multi_input_encoder_is_its_parts_side_by_side(
         "speed": vectors(3),
         "camera": images(3, 15, 16),
         "mode": spaces.Discrete(4),
-        "wrist": images(1, 17, 15),
+        "vectors": images(1, 17, 15),
         "joints": vectors(2, 2),
     }
     space = spaces.Dict({key: everything[key] for key in keys})
@@ -169,8 +167,8 @@ def test_multi_input_encoder_is_its_parts_side_by_side(
     assert isinstance(observations, dict)
 
     # Each image on its own, all that is no image as one flat vector, in the space's order.
-    inputs = [observations[key] for key in space.spaces if key in ("camera", "wrist")]
-    flat = [observations[key].reshape(3, -1) for key in space.spaces if key not in ("camera", "wrist")]
+    inputs = [observations[key] for key in space.spaces if key in ("camera", "vectors")]
+    flat = [observations[key].reshape(3, -1) for key in space.spaces if key not in ("camera", "vectors")]
     inputs += [th.cat(flat, dim=1)] if flat else []
     kinds = [PixelEncoder if x.ndim == 4 else vector_encoder for x in inputs]
     assert [type(part) for part in encoder.encoders] == kinds
@@ -232,25 +230,3 @@ def test_running_statistics_are_shared_saved_and_not_learnt_from_predictions(tmp
     model.save(tmp_path / "model")
     for some in (model, SACAux.load(tmp_path / "model")):
         assert all(th.equal(one, other) for one, other in zip(before, statistics(some), strict=True))
-
-
-def test_names() -> None:
-    expected = {
-        "pixel": PixelEncoder,
-        "dense_mlp": DenseMLP,
-        "mlp": MLP,
-        "simba": SimbaEncoder,
-        "multi_input": MultiInputEncoder,
-        "identity": FlattenExtractor,
-    }
-    assert dict(ENCODERS) == expected
-    assert {name: encoder_class(name) for name in expected} == expected
-
-    class Own(BaseFeaturesExtractor):
-        pass
-
-    assert encoder_class(Own) is Own
-    with pytest.raises(
-        ValueError, match="unknown encoder 'cnn', expected one of pixel, dense_mlp, mlp, simba, multi_input, identity"
-    ):
-        encoder_class("cnn")

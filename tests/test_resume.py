@@ -51,7 +51,8 @@ N_EVALUATIONS = 4
 def processes() -> ForkServerContext:
     """Processes that start with everything imported."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["search.training.run", "torch._dynamo"])  # which the first optimizer imports
+    # Those that DeepMind Control and the first optimizer import.
+    context.set_forkserver_preload(["search.training.run", "shimmy", "torch._dynamo"])
     return context
 
 
@@ -159,18 +160,9 @@ def test_a_killed_run_ends_like_an_undisturbed_one(case: str, tmp_path: Path, pr
 
     (curve, state), (expected_curve, expected_state) = result(folder), result(tmp_path / "undisturbed")
     assert curve == expected_curve and len(curve) == N_EVALUATIONS
+    assert len({point[1] for point in curve}) > 1 or case == "normalize"  # or equality would say little
     assert assert_same(state, expected_state) > 40
     assert not (folder / "checkpoint.pt").exists() and not (folder / "checkpoint.tmp").exists()
-
-
-@pytest.mark.slow
-def test_another_seed_is_another_run(tmp_path: Path) -> None:
-    """Else the tests above would be content with a constant."""
-    curves = []
-    for seed in (1, 2):
-        prepare_run(tmp_path / str(seed), make_run("simba", seed=seed, checkpoints=(60, 120)))
-        curves.append([point.mean for point in train(tmp_path / str(seed))])
-    assert len({*curves[0], *curves[1]}) == 4
 
 
 class Malicious:

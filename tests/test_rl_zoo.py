@@ -36,6 +36,12 @@ def run(folder: Path, *command: str) -> str:
     return done.stdout
 
 
+def in_one_process(folder: Path, *programs: list[str], then: str = "") -> str:
+    """What programs of RL-Zoo print, one after the other: importing takes longer than all they do."""
+    lines = [f"sys.argv = {['', *program]}\nmain()" for program in programs]
+    return run(folder, "-c", "\n".join(["import sys", "from sb3_aarl.rl_zoo import main", *lines, then]))
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder where RL-Zoo trained for 280 agent steps, 20 of them with gradient steps, and evaluated twice."""
@@ -68,7 +74,8 @@ def test_trains_with_the_hyperparameters_of_the_file(trained: Path) -> None:
 def test_enjoy_record_video_and_plots(trained: Path) -> None:
     folder = trained.parents[2]
     for i in (1, 2):  # plot_from_file needs two runs
-        shutil.copytree(trained, folder / "two/sac_aux" / trained.name.replace("_1", f"_{i}"))
+        copy = folder / "two/sac_aux" / trained.name.replace("_1", f"_{i}")
+        shutil.copytree(trained, copy, ignore=shutil.ignore_patterns("*.zip"))
     programs = [
         ["enjoy", *SAC_AUX, "-f", "logs", "-n", "260", "--no-render", "--device", "cpu", "--seed", "5"],
         ["record_video", *SAC_AUX, "-f", "logs", "-n", "3", "-o", "videos"],
@@ -76,10 +83,8 @@ def test_enjoy_record_video_and_plots(trained: Path) -> None:
         ["plot_from_file", "-i", "curves"],
         ["plot_train", "-a", "sac_aux", "-e", TASK, "-f", "logs", "-w", "1"],
     ]
-    # In one process, as importing takes longer than all they do.
-    lines = ["import sys", "from matplotlib import pyplot as plt", "from sb3_aarl.rl_zoo import main"]
-    lines += [f"sys.argv = {['', *program]}\nmain()" for program in programs]
-    printed = run(folder, "-c", "\n".join([*lines, "print([len(line.get_xdata()) for line in plt.gca().lines])"]))
+    n_points = "from matplotlib import pyplot as plt; print([len(line.get_xdata()) for line in plt.gca().lines])"
+    printed = in_one_process(folder, *programs, then=n_points)
 
     model = SACAux.load(trained / "dm_control-cheetah-run-v0.zip", device="cpu")
     env = make_dmc_env(TASK, action_repeat=4)
@@ -120,17 +125,6 @@ class Mine(PendulumEnv):
 
 gym.register("Mine-v0", Mine, max_episode_steps=20)
 """
-SBX = """
-import rl_zoo3
-import rl_zoo3.train
-from rl_zoo3.train import train
-from sb3_aarl import SACAux
-
-rl_zoo3.ALGOS["sac_aux"] = SACAux
-rl_zoo3.train.ALGOS = rl_zoo3.ALGOS
-rl_zoo3.exp_manager.ALGOS = rl_zoo3.ALGOS
-train()
-"""
 SMALL = """
 default: {n_timesteps: 60, policy: MlpPolicy, learning_rate: lin_1e-3, learning_starts: 40, batch_size: 8,
   normalize: "dict(norm_obs=True, norm_reward=False)", env_wrapper: [rl_zoo3.wrappers.HistoryWrapper: {horizon: 2}],
@@ -139,19 +133,20 @@ default: {n_timesteps: 60, policy: MlpPolicy, learning_rate: lin_1e-3, learning_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", [["-m", "sb3_aarl.rl_zoo", "train"], ["own.py"]], ids=["ours", "three lines of SBX"])
-def test_an_environment_of_ones_own_needs_no_program(program: list[str], tmp_path: Path) -> None:
+def test_an_environment_of_ones_own_needs_no_program(tmp_path: Path) -> None:
     pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
-    for name, text in (("my_envs.py", MY_ENVS), ("own.py", SBX), ("small.yml", SMALL)):
+    for name, text in (("my_envs.py", MY_ENVS), ("small.yml", SMALL)):
         (tmp_path / name).write_text(text)
     mine = ["--algo", "sac_aux", "--env", "Mine-v0", "--gym-packages", "my_envs"]
-    run(tmp_path, *program, *mine, "-conf", "small.yml", "--eval-freq", "-1", "--device", "cpu")
+    in_one_process(
+        tmp_path,
+        ["train", *mine, "-conf", "small.yml", "--eval-freq", "-1", "--device", "cpu"],
+        ["record_video", *mine, "-f", "logs", "-n", "3", "-o", "videos"],
+    )
     model = SACAux.load(tmp_path / "logs/sac_aux/Mine-v0_1/Mine-v0.zip", device="cpu")
     assert model.num_timesteps == 60 and model._n_updates == 20 and model.observation_space.shape == (2 * 3 + 2,)
     assert [model.lr_schedule(share) for share in (1, 0.5)] == [1e-3, 5e-4]
-    if program[0] == "-m":
-        run(tmp_path, "-m", "sb3_aarl.rl_zoo", "record_video", *mine, "-f", "logs", "-n", "3", "-o", "videos")
-        assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
+    assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
 
 
 def added(arguments: list[str]) -> dict[str, object]:

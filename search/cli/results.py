@@ -1,6 +1,5 @@
 """Commands that show what is stored and train nothing: table, analyze, status, report, dashboard, figures."""
 
-import math
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -116,15 +115,13 @@ def status(
     path = search_folder(folder, storage)
     data: dict[str, Any] = {}
     lines = []
-    tables: dict[str, list[dict[Any, Any]]] = {}
+    tables: dict[str, pd.DataFrame] = {}
     if storage is not None or path is None or (path / STUDY_FILE).exists():
         ((study, path),) = open_studies([folder], storage).values()
         progress, runs = search_status(study, path)
         data["search"] = {**progress._asdict(), "generations": [row._asdict() for row in progress.generations], "runs": runs}
-        tables["search"] = [
-            {"variant": f"generation {row.generation}", "runs": row.slots, "done": row.filled, **row._asdict()}
-            for row in progress.generations
-        ]
+        rows = [(f"generation {row.generation}", *row[1:]) for row in progress.generations]
+        tables["search"] = pd.DataFrame(rows, columns=["variant", "runs", "done", "running", "failed"])
         best = "nothing yet" if progress.best is None else f"{progress.best_loss}, score {progress.best:.2f}"
         complete = all(row.filled == row.slots for row in progress.generations)
         how = (
@@ -135,27 +132,17 @@ def status(
         found, to_go = matrix_status(path / part)
         if not found.empty:
             data[part or "benchmark"] = {"variants": records(found.set_index("variant")), "seconds_to_go": to_go}
-            tables[part or "benchmark"] = found.to_dict("records")
+            tables[part or "benchmark"] = found.assign(score=found["score"].map("{:.2f}".format).replace("nan", "-"))
             lines.append(f"{(part or 'benchmark').capitalize()}: {time_to_go(to_go)}")
     if not tables:
         raise ValueError(f"{path} has neither a search nor a benchmark. aarl search starts one")
     if json:
         say_json(data)
         return
-    columns = ["variant", "runs", "done", "running", "failed"]
-    for title, rows in tables.items():
-        shown = [
-            {name: str(row[name]) for name in columns} | {name: number(row[name]) for name in ("score",) if name in row}
-            for row in rows
-        ]
-        show_table(pd.DataFrame(shown), f"{path}, {title}")
+    for title, table in tables.items():
+        show_table(table.astype(str), f"{path}, {title}")
     for line in lines:
         say(line)
-
-
-def number(value: float | None) -> str:
-    """A score as it is shown."""
-    return "-" if value is None or math.isnan(value) else f"{value:.2f}"
 
 
 @app.command(rich_help_panel="A search")

@@ -90,22 +90,18 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
     Ask a trial for a loss, with any sampler of Optuna.
 
     :param trial: The trial
-    :param max_horizon: Longest horizon of the space
-    :param operators: Operators to search too, with and without negatives; None for mean squared error without
+    :param max_horizon: Longest horizon of the space; AuxLossSampler has its own
+    :param operators: Operators to search too, with and without negatives; None for mean squared error without. AuxLossSampler
+        has its own
     :raises optuna.TrialPruned: when what the sampler proposes, or a user enqueued, is not valid; nothing was trained then
-    :raises ValueError: when AuxLossSampler searches longer horizons, or other operators
     """
     check_operators(operators)
-    names = None if operators is None else tuple(operators)
     study: optuna.Study | None = getattr(trial, "study", None)  # a FixedTrial has none
-    longest = max_horizon
     if study is not None:
-        longest = getattr(study.sampler, "max_horizon", max_horizon)
         # Optuna would redraw what does not fit, and train another loss than the sampler recorded.
-        if longest > max_horizon or getattr(study.sampler, "operators", names) != names:
-            searched = f"max_horizon={longest} and operators={getattr(study.sampler, 'operators', names)}"
-            raise ValueError(f"the sampler searches {searched}, not max_horizon={max_horizon} and operators={names}")
-        _check_enqueued(study.get_trials(deepcopy=False)[trial.number], longest, operators)
+        max_horizon = getattr(study.sampler, "max_horizon", max_horizon)
+        operators = getattr(study.sampler, "operators", operators)
+        _check_enqueued(study.get_trials(deepcopy=False)[trial.number], max_horizon, operators)
     params: dict[str, Any] = {"horizon": trial.suggest_int("horizon", 1, max_horizon)}
     for name, distribution in distributions(params["horizon"], max_horizon, operators).items():
         if isinstance(distribution, CategoricalDistribution):

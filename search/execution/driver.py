@@ -17,7 +17,7 @@ from optuna.trial import TrialState
 from tenacity import Retrying, before_sleep_log, retry_if_exception_type, stop_after_delay, wait_random_exponential
 
 from sb3_aarl.aux_loss import AuxLoss
-from sb3_aarl.callbacks import Evaluation, aulc
+from sb3_aarl.callbacks import aulc
 from search.evolution.sampler import AuxLossSampler, GenerationProgress
 from search.evolution.space import loss_of, suggest_aux_loss
 from search.execution.runs import Executor, RunFailed, Submission, mean_curve
@@ -144,19 +144,15 @@ class Driver:
         """Give up trials of a driver that was killed: their slots get the same losses again, whose folders resume."""
         for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             if trial.number not in self.running:
-                self._interrupt(trial.number)
-
-    def _interrupt(self, number: int) -> None:
-        study_id = self.storage.get_study_id_from_name(self.study.study_name)
-        trial_id = self.storage.get_trial_id_from_study_id_trial_number(study_id, number)
-        if not self.storage.get_trial(trial_id).state.is_finished():
-            self.storage.set_trial_user_attr(trial_id, "interrupted", True)
-            self.study.tell(number, state=TrialState.FAIL)
+                study_id = self.storage.get_study_id_from_name(self.study.study_name)
+                trial_id = self.storage.get_trial_id_from_study_id_trial_number(study_id, trial.number)
+                self.storage.set_trial_user_attr(trial_id, "interrupted", True)
+                self.study.tell(trial.number, state=TrialState.FAIL)
 
     def _start(self, trial: optuna.Trial) -> None:
         """Submit a candidate's runs."""
         try:
-            loss = self._patiently(suggest_aux_loss, trial, self.sampler.max_horizon, self.sampler.operators)
+            loss = self._patiently(suggest_aux_loss, trial)
         except optuna.TrialPruned as problem:  # enqueued by the user, and not valid
             logger.warning("Trial %d: %s", trial.number, problem)
             self._tell(trial, state=TrialState.PRUNED)
@@ -164,8 +160,6 @@ class Driver:
         runs = self.make_runs(loss)
         attributes = {
             "loss": str(loss),
-            "canonical": str(loss.canonical()),
-            "environment": runs[0].environment,
             "commit": commit(),
             "versions": versions(),
             "threads": runs[0].threads,
@@ -198,7 +192,7 @@ class Driver:
             self._tell(trial, state=TrialState.PRUNED)
         else:
             self.n_failures = 0
-            self._tell(trial, values=score(curves))
+            self._tell(trial, values=float(np.mean([aulc(curve) for curve in curves])))
 
     def _report(self, running: RunningTrial, curve: list[list[float]]) -> None:
         """Report a step when all seeds have it."""
@@ -250,8 +244,3 @@ def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:
     """A candidate's folder, named after generation, slot and attempt, so that the next trial of a slot finds its runs."""
     at = trial.user_attrs
     return folder / "candidates" / f"generation-{at['generation']}" / f"slot-{at['slot']:03}" / f"attempt-{at['attempt']}"
-
-
-def score(curves: Sequence[Sequence[Evaluation]]) -> float:
-    """The score of a candidate: its mean area under the learning curve over the seeds."""
-    return float(np.mean([aulc(curve) for curve in curves]))

@@ -26,18 +26,13 @@ class RunFailed(RuntimeError):
     """Candidate after candidate failed; the message has the last reason."""
 
 
-class Future(Protocol):
-    """What ``submit`` returns: futures of ``concurrent.futures``, Ray and Dask, jobs of submitit."""
-
-    def done(self) -> bool: ...
-
-    def result(self) -> Any: ...
-
-
 class Executor(Protocol):
-    """Anything that runs a function somewhere."""
+    """
+    Anything that runs a function somewhere. ``submit`` returns what has ``done()`` and ``result()``: futures of
+    ``concurrent.futures``, Ray and Dask, jobs of submitit.
+    """
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future: ...
+    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Any: ...
 
 
 def start_run(folder: str) -> dict[str, Any]:
@@ -103,12 +98,9 @@ class LocalExecutor(ThreadPoolExecutor):
     """Processes of this machine: each thread starts one and waits for it. Leaving the ``with`` block ends those that run."""
 
     def __init__(self, workers: int = 1):
-        super().__init__(workers, thread_name_prefix="run", initializer=self._own_thread)
+        super().__init__(workers, thread_name_prefix="run", initializer=setattr, initargs=(_thread, "executor", self))
         self.processes: list[subprocess.Popen[bytes]] = []
         self.is_closed = False
-
-    def _own_thread(self) -> None:
-        _thread.executor = self
 
     def __exit__(self, *exception: Any) -> None:
         self.is_closed = True  # for threads that are just starting a process

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -45,29 +45,6 @@ COLUMNS: dict[str, Any] = {
 METRICS = ("aulc", "first", "last")
 
 
-def score_of(trial: FrozenTrial) -> float | None:
-    """The score of a completed trial; None for all others, and where it is not finite."""
-    finished = trial.state == TrialState.COMPLETE and trial.value is not None and math.isfinite(trial.value)
-    return trial.value if finished else None
-
-
-def ranked(trials: Iterable[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> list[FrozenTrial]:
-    """The trials that have a score, the best first."""
-    sign = -1 if direction == StudyDirection.MAXIMIZE else 1
-    scores = [(score, trial) for trial in trials if (score := score_of(trial)) is not None]
-    return [trial for _, trial in sorted(scores, key=lambda scored: (sign * scored[0], scored[1].number))]
-
-
-def lineage(trial: FrozenTrial, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-    """All ancestors of a trial, the latest first."""
-    line, wanted = [], set(trial.user_attrs.get("parents", ()))
-    for earlier in reversed(trials[: trial.number]):
-        if earlier.number in wanted:
-            line.append(earlier)
-            wanted |= set(earlier.user_attrs.get("parents", ()))
-    return line
-
-
 def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
     The trials of a study as the table that the other functions take, one row each, finished or not: ``score`` is NaN where
@@ -75,7 +52,8 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
     rows = []
     for trial in trials:
-        loss, score = loss_of(trial), score_of(trial)
+        loss = loss_of(trial)
+        has_score = trial.state == TrialState.COMPLETE and trial.value is not None and math.isfinite(trial.value)
         row = {
             "number": trial.number,
             "state": "interrupted" if trial.user_attrs.get("interrupted") else trial.state.name.lower(),
@@ -83,13 +61,27 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
             "generation": trial.user_attrs.get("generation", 1),
             "operation": trial.user_attrs.get("operation", "-"),
             "parents": list(trial.user_attrs.get("parents", ())),
-            "score": np.nan if score is None else score,
+            "score": trial.value if has_score else np.nan,
             "loss": loss,
             "canonical": None if loss is None else loss.canonical(),
             "curve": trial.user_attrs.get("curve", []),
         }
         rows.append(row | {key: getattr(loss, key, None) for key in ("horizon", "operator", "negatives")})
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
+
+
+def ranked(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
+    """The trials that have a score, the best first; of equals those with lower numbers."""
+    return table.dropna(subset="score").sort_values("score", ascending=direction == StudyDirection.MINIMIZE, kind="stable")
+
+
+def lineage(number: int, table: pd.DataFrame) -> pd.DataFrame:
+    """A trial and all its ancestors, the latest first."""
+    wanted = {number}
+    for earlier in range(number, -1, -1):
+        if earlier in wanted:
+            wanted |= set(table["parents"][earlier])
+    return table.loc[sorted(wanted, reverse=True)]
 
 
 def analysed(table: pd.DataFrame) -> pd.DataFrame:
@@ -246,21 +238,16 @@ def diversity(table: pd.DataFrame) -> pd.DataFrame:
 
 def rankings(table: pd.DataFrame) -> pd.DataFrame:
     """
-    The trials of :func:`analysed` that have a curve, in the order of AULC, with their ranks by AULC and by their mean
-    returns at the first and the last checkpoint.
+    The trials of :func:`analysed` that have a curve, with their scores under the metrics: AULC, and the mean returns at the
+    first and the last checkpoint. Of equals :meth:`pandas.DataFrame.nlargest` takes those with lower numbers.
     """
     trials = table[table["curve"].map(len) > 0]
     if trials.empty:
         raise ValueError("no complete trial has a learning curve")
     if trials["curve"].map(lambda curve: tuple(point[0] for point in curve)).nunique() > 1:
         raise ValueError("trials were evaluated at different environment steps: their learning curves cannot be compared")
-    result = trials[["number", "loss", "curve"]].copy()
-    returns = trials["curve"].map(lambda curve: [mean for _, mean, _ in curve])
-    result["aulc"] = returns.map(np.mean).astype(float)
-    result["first"], result["last"] = returns.str[0].astype(float), returns.str[-1].astype(float)
-    for name in METRICS:
-        result[f"rank_{name}"] = result[name].rank(ascending=False, method="min").astype(int)
-    return result.sort_values(["rank_aulc", "number"]).reset_index(drop=True)
+    returns = np.array([[mean for _, mean, _ in curve] for curve in trials["curve"]])
+    return trials[["number", "curve"]].assign(aulc=returns.mean(axis=1), first=returns[:, 0], last=returns[:, -1])
 
 
 def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
@@ -271,7 +258,7 @@ def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
     rows = {}
     for pair in combinations(METRICS, 2):
         first, second = (ranking[metric] for metric in pair)
-        leaders = [set(leading(ranking, metric, top)["number"]) for metric in pair]
+        leaders = [set(ranking.nlargest(top, metric)["number"]) for metric in pair]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # too few trials, or all alike: NaN
             correlations = {method: first.corr(second, method=method) for method in ("spearman", "kendall")}
@@ -279,21 +266,15 @@ def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def leading(ranking: pd.DataFrame, metric: str, top: int = 10) -> pd.DataFrame:
-    """The best trials under a metric (``aulc``, ``first`` or ``last``); of equals the ones with lower numbers."""
-    return ranking.sort_values([f"rank_{metric}", "number"]).head(top)
-
-
-def winner_lineage(trials: Sequence[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
+def winner_lineage(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
     """The best trial and all its ancestors, the latest first; ``gain`` is the score less that of the best parent."""
-    best = ranked(trials, direction)[:1]
-    line = [*best, *(ancestor for trial in best for ancestor in lineage(trial, trials))]
-    table = trial_table(line).set_index("number")
+    best = ranked(table, direction)["number"].tolist()
+    line = (lineage(best[0], table) if best else table).set_index("number")
     best_of = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
-    parents = [best_of(table["score"].reindex(numbers)) if numbers else np.nan for numbers in table["parents"]]
-    table["gain"] = table["score"] - np.array(parents, dtype=float)
-    table["loss"] = [None if loss is None else str(loss) for loss in table["loss"]]
-    return table[["generation", "operation", "parents", "score", "gain", "loss"]]
+    parents = [best_of(table["score"][numbers]) if numbers else np.nan for numbers in line["parents"]]
+    line["gain"] = line["score"] - np.array(parents, dtype=float)
+    line["loss"] = [None if loss is None else str(loss) for loss in line["loss"]]
+    return line[["generation", "operation", "parents", "score", "gain", "loss"]]
 
 
 def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
@@ -335,7 +316,7 @@ def summary(
         "horizon": effects(table, "horizon"),
         "operation": effects(table, "operation"),
         "diversity": diversity(table),
-        "lineage": winner_lineage(trials, direction),
+        "lineage": winner_lineage(table, direction),
         "machines": machines(trials),
     }
     if len(analysed(table)[operator].drop_duplicates()) > 1:

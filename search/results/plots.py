@@ -174,12 +174,12 @@ def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
     first, last = (EngFormatter(sep="")(step) for step in (steps[0], steps[-1]))
     names = {"aulc": "AULC", "first": f"the return at {first} steps", "last": f"the return at {last} steps"}
     figure, panels = _panels(list(names.values()), "Mean return", columns=3, width=4.2, height=3.6)
-    by_aulc = set(analysis.leading(ranking, "aulc", top)["number"])
+    by_aulc = set(ranking.nlargest(top, "aulc")["number"])
     looks = {True: ("-", "#8c8c8c", f"in the top {top} by AULC"), False: (":", "black", "not in it")}
     for axes in panels[1:]:
         axes.sharey(panels[0])
     for axes, (metric, name) in zip(panels, names.items(), strict=True):
-        best = analysis.leading(ranking, metric, top)
+        best = ranking.nlargest(top, metric)
         means = np.array([[mean for _, mean, _ in curve] for curve in best["curve"]])
         for number, curve in zip(best["number"], means, strict=True):
             line, colour, label = looks[number in by_aulc]

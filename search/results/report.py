@@ -3,7 +3,7 @@
 import io
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from optuna import Study
-from optuna.trial import FrozenTrial
 
 from sb3_aarl.callbacks import replace_text
 from search.execution.matrix import comparable, stored_scores, task_name
@@ -49,7 +48,7 @@ def write_report(
     """Write the report of a study, finished or not, with baselines and the runs of its cross-validation as one HTML file."""
     trials = study.get_trials(deepcopy=False)
     table = analysis.trial_table(trials)
-    best = analysis.ranked(trials, study.direction)
+    best = analysis.ranked(table, study.direction)
     title, baselines = study.study_name, list(baselines)
     summary = analysis.summary(trials, study.direction)
     n_analysed = len(analysis.analysed(table))
@@ -65,10 +64,10 @@ def write_report(
         hours=summary.tables["machines"]["hours"].sum(),
         generations=analysis.readable("generations", generation_table(table)),
         baselines=baselines,
-        evolution=_picture(evolution_plot({title: table}, {title: baselines}, study.direction)) if best else None,
+        evolution=_picture(evolution_plot({title: table}, {title: baselines}, study.direction)) if len(best) else None,
         best=_candidates(best[:N_BEST]),
         winner=_candidates(best[:1]).to_dict("records"),
-        lineage=_candidates(analysis.lineage(best[0], trials)) if best else None,
+        lineage=_candidates(analysis.lineage(best["number"].iloc[0], table)[1:]) if len(best) else None,
         validation=_validation(validation),
         n_analysed=n_analysed,
         tables={name: analysis.readable(name, frame) for name, frame in summary.tables.items()},
@@ -83,9 +82,8 @@ def write_report(
     replace_text(Path(path), html)
 
 
-def _candidates(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
+def _candidates(table: pd.DataFrame) -> pd.DataFrame:
     """Trials with their losses."""
-    table = analysis.trial_table(trials)
     text = analysis.readable("candidates", table.set_index("number")[["score", "generation", "operation", "parents"]])
     text.insert(0, "Loss", [Markup("<code>{}</code>").format(loss or "no loss") for loss in table["loss"]])
     return text

@@ -115,7 +115,8 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     """
     keys = ["checkpoint", "environment", "variant"]
     numbers = ["paper_mean", "paper_std", "paper_runs"]
-    result = _normalized(runs) if number == 6 else _by_task(runs)
+    by_task = runs.groupby(keys, sort=False)["mean"].agg(planned="size", runs="count", mean="mean", std="std").reset_index()
+    result = _normalized(runs) if number == 6 else by_task
     paper = paper_scores(number)
     headings = dict(zip(paper["variant"], paper["column"], strict=True))
     paper = paper.rename(columns={"variant": "paper_variant", "mean": numbers[0], "std": numbers[1], "runs": numbers[2]})
@@ -140,11 +141,6 @@ def _is_comparable(comparison: pd.DataFrame) -> bool:
     is_normalized = (comparison["environment"] == NORMALIZED).any()
     variants = sorted(comparison.dropna(subset="mean")["variant"].str.removesuffix(BF16))
     return not is_normalized or variants == sorted(_paper()[6]["columns"].values())
-
-
-def _by_task(runs: pd.DataFrame) -> pd.DataFrame:
-    groups = runs.groupby(["checkpoint", "environment", "variant"], sort=False)["mean"]
-    return groups.agg(planned="size", runs="count", mean="mean", std="std").reset_index()
 
 
 def _normalized(runs: pd.DataFrame) -> pd.DataFrame:

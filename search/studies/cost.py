@@ -2,13 +2,14 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 
 import pandas as pd
 import torch as th
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_aarl.buffers import ARRAYS, WindowReplayBuffer
-from search.training.run import Run, Setup, closing_env
+from search.training.run import Run, Setup
 
 MEASURED_SECONDS = 2.0
 MEASURED_STEPS = 50  # at least, so that there are windows
@@ -20,7 +21,7 @@ def measure(run: Run) -> dict[str, float]:
     """Train a run for some seconds, and return what all of it, its evaluations included, would take here."""
     th.set_num_threads(run.threads)
     setup = Setup(run, run.environment)
-    with closing_env(setup.training_env()) as env:
+    with closing(setup.training_env()) as env:
         model = setup.model(env)
         learning_starts, gradient_steps = model.learning_starts, model.gradient_steps
         model.learning_starts = MEASURED_STEPS - 2

@@ -13,10 +13,9 @@ from optuna.study import StudyDirection
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
-from search.evolution.space import loss_of
 from search.evolution.surrogate import TokenModel
 from search.execution.matrix import Cell, Matrix
-from search.results.analysis import ranked
+from search.results.analysis import analysed, ranked, trial_table
 from search.studies.config import Baseline, CrossValidation, SearchConfig
 from search.studies.search import make_run
 from search.training.config import ConfigError
@@ -30,16 +29,12 @@ def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLos
     The best candidates of a search by their scores, the best first, and after them ``top_rated`` others that the surrogate,
     fitted to all scores, rates highest; in canonical form and each once.
     """
-    scores = [
-        (loss.canonical(), trial.value)
-        for trial in ranked(study.get_trials(deepcopy=False), study.direction)
-        if (loss := loss_of(trial)) is not None and trial.value is not None
-    ]
-    if not scores:
+    scored = ranked(analysed(trial_table(study.get_trials(deepcopy=False))), study.direction)
+    if scored.empty:
         raise ValueError(f"study {study.study_name!r} has no completed candidate yet")
-    losses = list(dict.fromkeys(loss for loss, _ in scores))
+    losses = list(dict.fromkeys(scored["canonical"]))
     surrogate = TokenModel(max(loss.horizon for loss in losses))
-    surrogate.add(*zip(*scores, strict=True))
+    surrogate.add(list(scored["canonical"]), list(scored["score"]))
     rated = sorted(losses[top:], key=surrogate.rating, reverse=study.direction == StudyDirection.MAXIMIZE)
     return losses[:top] + rated[:top_rated]
 

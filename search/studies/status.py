@@ -51,7 +51,7 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     table["score"] = by_variant["score"].mean().where(by_variant["task"].nunique() == 1)
     left = len(runs) - runs["done"].sum() - runs["failed"].sum()
     to_go = runs["seconds"].mean() * left / max(1, runs["running"].sum())
-    return table.reset_index(), float(to_go) if runs["done"].any() else None
+    return table.reset_index(), 0.0 if not left else float(to_go) if runs["done"].any() else None
 
 
 def is_locked(path: Path) -> bool:

@@ -61,7 +61,10 @@ def save(folder: Path, model: SACAux, curve: Sequence[Evaluation]) -> None:
     state = {
         "model": model.training_state(),
         "replay_buffer": model.replay_buffer.training_state(),
-        "normalization": _normalization_state(model.get_vec_normalize_env()),
+        "normalization": {
+            name: (th.as_tensor(statistics.mean), th.as_tensor(statistics.var), float(statistics.count))
+            for name, statistics in _statistics(model.get_vec_normalize_env()).items()
+        },
         "curve": [list(evaluation) for evaluation in curve],
     }
     with (folder / UNFINISHED).open("wb") as file:
@@ -84,17 +87,16 @@ def load(model: SACAux, state: Mapping[str, Any]) -> None:
     assert isinstance(model.replay_buffer, WindowReplayBuffer)
     model.load_training_state(state["model"])
     model.replay_buffer.load_training_state(state["replay_buffer"])
-    for name, (mean, var, count) in state["normalization"].items():
-        statistics = getattr(model.get_vec_normalize_env(), name)
+    for name, statistics in _statistics(model.get_vec_normalize_env()).items():
+        mean, var, count = state["normalization"][name]
         statistics.mean, statistics.var, statistics.count = mean.numpy(), var.numpy(), count
 
 
-def _normalization_state(env: VecNormalize | None) -> dict[str, Any]:
+def _statistics(env: VecNormalize | None) -> dict[str, Any]:
+    """VecNormalize's running statistics by name; Dict observations have those of each key."""
     found = {name: getattr(env, name) for name in ("obs_rms", "ret_rms") if hasattr(env, name)}
-    return {
-        name: (th.as_tensor(statistics.mean), th.as_tensor(statistics.var), float(statistics.count))
-        for name, statistics in found.items()
-    }
+    parts = found["obs_rms"] if isinstance(found.get("obs_rms"), dict) else {}
+    return found if not parts else {"ret_rms": found["ret_rms"]} | {f"obs_rms/{key}": part for key, part in parts.items()}
 
 
 def remove(folder: Path) -> None:

@@ -1,7 +1,6 @@
 """A training run: a value, ``Run``, and a folder with ``run.json``, from which it is trained, and ``curve.csv``."""
 
 import argparse
-import contextlib
 import functools
 import importlib
 import inspect
@@ -12,6 +11,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -269,7 +269,7 @@ def check_run(run: Run) -> Setup:
     """Make environment and model of a run once, and make a step; warn of what a user may not have meant. Return its setup."""
     try:
         setup = Setup(run, run.environment)
-        with closing_env(setup.training_env()) as env:
+        with closing(setup.training_env()) as env:
             model = setup.model(env)
             learning_starts = model.learning_starts
             env.reset()
@@ -292,15 +292,6 @@ def check_run(run: Run) -> Setup:
         message = "evaluating every %d environment steps truncates episodes, which may have %d"
         logger.warning(message, apart // setup.n_envs, setup.episode_steps)
     return setup
-
-
-@contextlib.contextmanager
-def closing_env(env: VecEnv) -> Iterator[VecEnv]:
-    try:
-        yield env
-    finally:
-        with contextlib.suppress(EOFError, OSError):  # its processes may be gone
-            env.close()
 
 
 def _one_line(error: BaseException) -> str:
@@ -342,7 +333,7 @@ def _train(folder: Path, run: Run, progress_bar: bool, on_evaluation: Callable[[
     trained = curve[-1].environment_steps if curve else 0
     if curve:
         logger.warning("%s is resumed at %d environment steps", folder, trained)
-    with closing_env(setup.training_env(trained)) as env, closing_env(setup.evaluation_env()) as evaluation_env:
+    with closing(setup.training_env(trained)) as env, closing(setup.evaluation_env()) as evaluation_env:
         model = setup.model(env)
         evaluations = LearningCurveCallback(
             evaluation_env,
