@@ -197,7 +197,7 @@ class Driver:
     def _report(self, running: RunningTrial, curve: list[list[float]]) -> None:
         """Report a step when all seeds have it."""
         trial, news = running.trial, curve[running.n_reported :]
-        for steps, mean, _ in news:
+        for steps, mean in news:
             self._patiently(trial.report, mean, int(steps))
             running.n_reported += 1
             if steps != running.submissions[0].run.checkpoints[-1] and self._patiently(trial.should_prune):

@@ -81,17 +81,9 @@ def _train(folder: Path) -> int:
 
 
 def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
-    """
-    The learning curve over several seeds with equally many episodes, as long as the shortest: environment steps, mean and
-    standard deviation over the episodes of all seeds, for every evaluation.
-    """
-    points = []
-    for evaluations in zip(*curves, strict=False):
-        means, deviations = np.array([(evaluation.mean, evaluation.std) for evaluation in evaluations]).T
-        # The variance of all episodes: within the seeds, and between them.
-        std = float(np.sqrt((deviations**2).mean() + means.var()))
-        points.append([evaluations[0].environment_steps, float(means.mean()), std])
-    return points
+    """The learning curve over several seeds, as long as the shortest: environment steps and mean return of each evaluation."""
+    evaluations = zip(*curves, strict=False)
+    return [[points[0].environment_steps, float(np.mean([point.mean for point in points]))] for points in evaluations]
 
 
 class LocalExecutor(ThreadPoolExecutor):

@@ -48,7 +48,7 @@ METRICS = ("aulc", "first", "last")
 def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
     The trials of a study as the table that the other functions take, one row each, finished or not: ``score`` is NaN where
-    there is none, ``loss`` and ``canonical`` an AuxLoss or None, ``curve`` a list of (environment steps, mean, deviation).
+    there is none, ``loss`` and ``canonical`` an AuxLoss or None, ``curve`` a list of (environment steps, mean return).
     """
     rows = []
     for trial in trials:
@@ -246,7 +246,7 @@ def rankings(table: pd.DataFrame) -> pd.DataFrame:
         raise ValueError("no complete trial has a learning curve")
     if trials["curve"].map(lambda curve: tuple(point[0] for point in curve)).nunique() > 1:
         raise ValueError("trials were evaluated at different environment steps: their learning curves cannot be compared")
-    returns = np.array([[mean for _, mean, _ in curve] for curve in trials["curve"]])
+    returns = np.array([[point[1] for point in curve] for curve in trials["curve"]])
     return trials[["number", "curve"]].assign(aulc=returns.mean(axis=1), first=returns[:, 0], last=returns[:, -1])
 
 

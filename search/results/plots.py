@@ -180,7 +180,7 @@ def rankings_plot(table: pd.DataFrame, top: int = 10) -> Figure:
         axes.sharey(panels[0])
     for axes, (metric, name) in zip(panels, names.items(), strict=True):
         best = ranking.nlargest(top, metric)
-        means = np.array([[mean for _, mean, _ in curve] for curve in best["curve"]])
+        means = np.array([[point[1] for point in curve] for curve in best["curve"]])
         for number, curve in zip(best["number"], means, strict=True):
             line, colour, label = looks[number in by_aulc]
             axes.plot(steps, curve, line, color=colour, lw=1.1, label=label)
