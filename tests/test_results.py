@@ -199,6 +199,17 @@ def test_decisions_by_runs_of_aarl_state(task: str) -> None:
         assert max(curl + sac + identity) < min(map(min, runs)) and statistics.mean(curl) < statistics.mean(sac)
 
 
+def test_the_distance_from_the_paper_on_walker_walk_is_that_of_the_action_repeat() -> None:
+    def returns(*variants: str) -> list[float]:
+        return [value for variant in variants for value in last_returns(variant, "walker-walk")]
+
+    names = ("sac_identity_small", "sac_dense_mlp_small", "aarl_state_small")
+    four = [returns(name, f"{name}_orthogonal") for name in names]
+    two = [returns(f"{name}_repeat_2", f"{name}_orthogonal_squashed_repeat_2") for name in names]
+    assert max(four[0] + four[1] + returns("sac_identity_small_orthogonal_squashed")) < min(two[0] + two[1])
+    assert are_close(two[0] + two[1], two[2]) and are_close(two[2], four[2])
+
+
 def test_decisions_by_runs_with_orthogonal_layers() -> None:
     identity, orthogonal, squashed = (
         [last_returns(f"sac_identity_small{choice}", task) for task in TASKS]
