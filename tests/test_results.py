@@ -200,14 +200,14 @@ def test_decisions_by_runs_of_aarl_state(task: str) -> None:
 
 
 def test_the_distance_from_the_paper_on_walker_walk_is_that_of_the_action_repeat() -> None:
-    def returns(*variants: str) -> list[float]:
-        return [value for variant in variants for value in last_returns(variant, "walker-walk")]
+    def returns(*changes: str, of: tuple[str, ...] = ("sac_identity", "sac_dense_mlp")) -> list[float]:
+        return [value for name in of for change in changes for value in last_returns(f"{name}_small{change}", "walker-walk")]
 
-    names = ("sac_identity_small", "sac_dense_mlp_small", "aarl_state_small")
-    four = [returns(name, f"{name}_orthogonal") for name in names]
-    two = [returns(f"{name}_repeat_2", f"{name}_orthogonal_squashed_repeat_2") for name in names]
-    assert max(four[0] + four[1] + returns("sac_identity_small_orthogonal_squashed")) < min(two[0] + two[1])
-    assert are_close(two[0] + two[1], two[2]) and are_close(two[2], four[2])
+    repeat_2 = ("_repeat_2", "_orthogonal_squashed_repeat_2")
+    assert max(returns("")) < min(returns("_repeat_2"))
+    assert max(returns("_orthogonal", "_orthogonal_squashed")) < min(returns("_orthogonal_squashed_repeat_2"))
+    assert are_close(returns(*repeat_2), returns(*repeat_2, of=("aarl_state",)))
+    assert are_close(returns(*repeat_2, of=("aarl_state",)), returns("", "_orthogonal", of=("aarl_state",)))
 
 
 def test_decisions_by_runs_with_orthogonal_layers() -> None:
