@@ -120,7 +120,7 @@ class DenseMLP(Encoder):
         self.projection = self.make_projection()
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        x = observations.reshape(len(observations), -1)
+        x = observations.reshape(observations.shape[0], -1)
         for layer in self.layers:
             added = layer(x).relu()
             x = th.cat([x, added], dim=1) if self.dense else added
@@ -188,7 +188,7 @@ class SimbaEncoder(Encoder):
         self.projection = nn.Sequential()
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        return self.layers(self.normalization(observations.reshape(len(observations), -1)))
+        return self.layers(self.normalization(observations.reshape(observations.shape[0], -1)))
 
 
 VECTOR_ENCODERS: Mapping[str, type[DenseMLP] | type[SimbaEncoder]] = {
@@ -233,7 +233,7 @@ class MultiInputEncoder(Encoder):
         inputs = [observations[key] for key in self.image_keys]
         if self.vector_keys:
             parts = (observations[key] for key in self.vector_keys)
-            inputs.append(th.cat([part.reshape(len(part), -1) for part in parts], dim=1))
+            inputs.append(th.cat([part.reshape(part.shape[0], -1) for part in parts], dim=1))
         return inputs
 
     def trunk(self, observations: TensorDict) -> th.Tensor:  # type: ignore[override]

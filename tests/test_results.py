@@ -8,6 +8,8 @@ import re
 import runpy
 import shlex
 import statistics
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -118,7 +120,10 @@ def test_commands_have_the_interval(
 
 @pytest.mark.slow
 def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = make_readme["readme"](RESULTS)
+    # In a process of its own: other tests leave a console of another width.
+    program = "import pathlib, runpy, sys; print(runpy.run_path(sys.argv[1])['readme'](pathlib.Path(sys.argv[2])), end='')"
+    command = [sys.executable, "-c", program, RESULTS / "make_readme.py", RESULTS]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert (RESULTS / "README.md").read_text(encoding="utf-8") == text, "python results/make_readme.py"
     repeated = [about for command in commands(text) for about in abouts_of(command, tmp_path, monkeypatch)]
     for folder in make_readme["folders"](RESULTS):
