@@ -4,6 +4,7 @@ import inspect
 import itertools
 import json
 import math
+import os
 import re
 import runpy
 import shlex
@@ -120,10 +121,11 @@ def test_commands_have_the_interval(
 
 @pytest.mark.slow
 def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # In a process of its own: other tests leave a console of another width.
+    # In a process of its own: rich's console is as wide as COLUMNS, which pytest-xdist sets, is at its import.
     program = "import pathlib, runpy, sys; print(runpy.run_path(sys.argv[1])['readme'](pathlib.Path(sys.argv[2])), end='')"
     command = [sys.executable, "-c", program, RESULTS / "make_readme.py", RESULTS]
-    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    environment = {**os.environ, "COLUMNS": "120"}
+    text = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
     assert (RESULTS / "README.md").read_text(encoding="utf-8") == text, "python results/make_readme.py"
     repeated = [about for command in commands(text) for about in abouts_of(command, tmp_path, monkeypatch)]
     for folder in make_readme["folders"](RESULTS):
