@@ -1,5 +1,6 @@
 """Searches for real: the program aarl, processes that train, SIGKILL, PostgreSQL that restarts, Ray nodes that go."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -56,7 +57,12 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Slots:
 
 def runs_of_driver(pid: int) -> list[int]:
     """Processes that train for a driver."""
-    return [process.pid for process in psutil.Process(pid).children() if "search.training.run" in process.cmdline()]
+    found = []
+    for process in psutil.Process(pid).children():
+        with contextlib.suppress(psutil.NoSuchProcess):  # it has just ended
+            if "search.training.run" in process.cmdline():
+                found.append(process.pid)
+    return found
 
 
 def refused(*arguments: object) -> str:
