@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_aarl.callbacks import Evaluation, write_curve
-from search.training.run import Run, train
+from search.training.run import Run, read_run, train
 
 
 class InProcess:
@@ -19,11 +19,14 @@ class InProcess:
 
     def submit(self, fn: Any, path: str) -> "Future[Any]":
         future: Future[Any] = Future()
-        future.set_result({"curve": [list(point) for point in train(Path(path))], "failure": None, "retry": False})
+        future.set_result(self.outcome(Path(path)))
         return future
 
+    def outcome(self, folder: Path) -> dict[str, Any]:
+        return {"curve": [list(point) for point in train(folder)], "failure": None, "retry": False}
 
-class Planted:
+
+class Planted(InProcess):
     """Runs that end at once: with a score for each loss, or a failure."""
 
     def __init__(self) -> None:
@@ -36,23 +39,14 @@ class Planted:
         self.arguments = arguments
         return self
 
-    def __enter__(self) -> "Planted":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        pass
-
-    def submit(self, fn: Any, path: str) -> "Future[Any]":
-        run = Run.model_validate_json((Path(path) / "run.json").read_text())
+    def outcome(self, folder: Path) -> dict[str, Any]:
+        run = read_run(folder)
         self.runs.append(run)
-        future: Future[Any] = Future()
         if self.fails(run):
-            future.set_result({"curve": [], "failure": "it burst", "retry": False})
-            return future
+            return {"curve": [], "failure": "it burst", "retry": False}
         score = self.scores.get(run.aux_loss, 1.0) + run.seed
         curve = [
             Evaluation(steps, score + side, 0.5, 1, 1.0) for steps, side in zip(run.checkpoints, (-1.0, 1.0), strict=True)
         ]
-        write_curve(Path(path) / "curve.csv", curve)
-        future.set_result({"curve": [list(point) for point in curve], "failure": None, "retry": False})
-        return future
+        write_curve(folder / "curve.csv", curve)
+        return {"curve": [list(point) for point in curve], "failure": None, "retry": False}

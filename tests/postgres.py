@@ -105,12 +105,6 @@ class Postgres:
         self._process.send_signal(signal.SIGQUIT if crash else signal.SIGINT)
         self._process.wait(timeout=30)
 
-    def restart(self, crash: bool = False, seconds: float = 0.0) -> None:
-        """Stop the server, and start it again some seconds later."""
-        self.stop(crash)
-        time.sleep(seconds)
-        self.start()
-
     def close(self) -> None:
         """Stop the server and delete all that it has."""
         if self._process.poll() is None:

@@ -157,6 +157,7 @@ def test_small_studies_give_counts_and_no_p_values():
     assert analysis.table5(empty)["n_with"].sum() == 0 and analysis.population(empty).sum() == 0
     assert analysis.effects(empty, "horizon").empty and analysis.diversity(empty).empty
     assert analysis.winner_lineage(empty).empty
+    assert analysis.winner_lineage(analysis.trial_table([make_trial(None, state=TrialState.FAIL)])).empty
     problems = {"importances", "rank_agreement"}
     assert analysis.summary([]).problems.keys() == problems and not analysis.summary([]).tables.keys() & problems
 

@@ -1,4 +1,4 @@
-"""The paper's procedures: the study of a search, its runs, baselines, cross-validation, operators; one run by hand."""
+"""The paper's procedures: the study of a search, its runs, baselines, cross-validation, operators."""
 
 from pathlib import Path
 from typing import Any

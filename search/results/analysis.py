@@ -269,7 +269,7 @@ def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
 def winner_lineage(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
     """The best trial and all its ancestors, the latest first; ``gain`` is the score less that of the best parent."""
     best = ranked(table, direction)["number"].tolist()
-    line = (lineage(best[0], table) if best else table).set_index("number")
+    line = (lineage(best[0], table) if best else table[:0]).set_index("number")
     best_of = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
     parents = [best_of(table["score"][numbers]) if numbers else np.nan for numbers in line["parents"]]
     line["gain"] = line["score"] - np.array(parents, dtype=float)

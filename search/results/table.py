@@ -115,8 +115,11 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     """
     keys = ["checkpoint", "environment", "variant"]
     numbers = ["paper_mean", "paper_std", "paper_runs"]
-    by_task = runs.groupby(keys, sort=False)["mean"].agg(planned="size", runs="count", mean="mean", std="std").reset_index()
-    result = _normalized(runs) if number == 6 else by_task
+    if number == 6:
+        result = _normalized(runs)
+    else:
+        by_task = runs.groupby(keys, sort=False)["mean"]
+        result = by_task.agg(planned="size", runs="count", mean="mean", std="std").reset_index()
     paper = paper_scores(number)
     headings = dict(zip(paper["variant"], paper["column"], strict=True))
     paper = paper.rename(columns={"variant": "paper_variant", "mean": numbers[0], "std": numbers[1], "runs": numbers[2]})
