@@ -54,7 +54,9 @@ def disturb(config: Path, folder: Path, url: str | None, server: Postgres | None
             process = start(*arguments, folder=folder)
             counts["killed drivers"] += 1
         elif server is not None and not counts["restarted servers"] and minutes > 1:
-            server.restart(crash=True, seconds=5)
+            server.stop(crash=True)
+            time.sleep(5)
+            server.start()
             counts["restarted servers"] += 1
         elif runs := psutil.Process(process.pid).children() if process.poll() is None else []:
             rng.choice(runs).kill()
