@@ -25,7 +25,7 @@ STANDARD_ERRORS = 2.0
 MARKS = {"higher": "▲", "lower": "▼", "": ""}
 # The row of table 6, which has no environments.
 NORMALIZED = "normalized"
-# With more variants than that they go down the rows, and their pairs are left to --json.
+# With more variants than that they go down the rows, and of their pairs those with the best one are shown.
 MANY = 6
 # Suffix of a variant whose networks compute in bfloat16: the paper's all the same.
 BF16 = "_bf16"
@@ -251,21 +251,25 @@ def _statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
         tables.append(table)
     for checkpoint, part in _few(better).groupby("checkpoint"):
         title = f"Probability that a run of the row is better than one of the column, at {_steps(checkpoint)}"
-        cells = part["probability"].map("{:.2f} ".format) + [
-            _range(low, high, ".2f") for low, high in zip(part["low"], part["high"], strict=True)
+        cells = [
+            f"{row.probability:.2f} {_range(row.low, row.high, '.2f')}" + ("" if math.isnan(row.p) else f" p {row.p:.2g}")
+            for row in part.itertuples()
         ]
-        variants = list(part["variant"].unique())
         matrix = part.assign(cell=cells).pivot(index="variant", columns="over", values="cell").fillna("")
-        table = Table("", *map(escape, variants), title=title)
+        variants = list(part["variant"].unique())
+        columns = [variant for variant in variants if variant in matrix] or list(matrix)
+        table = Table("", *map(escape, columns), title=title)
         for variant in variants:
-            table.add_row(escape(variant), *matrix.loc[variant, variants])
+            table.add_row(escape(variant), *matrix.loc[variant, columns])
         tables.append(table)
     return tables
 
 
 def _few(better: pd.DataFrame) -> pd.DataFrame:
-    """The probabilities at checkpoints that have few variants: a table of all pairs fits a page."""
-    return better[better.groupby("checkpoint")["variant"].transform("nunique") <= MANY]
+    """The pairs that fit a page: of checkpoints with many variants those with the one that is best on average."""
+    n_variants = better.groupby("checkpoint")["variant"].transform("nunique")
+    best = better.groupby(["checkpoint", "variant"])["probability"].mean().groupby("checkpoint").idxmax()
+    return better[(n_variants <= MANY) | pd.Series(zip(better["checkpoint"], better["over"]), better.index).isin(best)]
 
 
 def footnotes(tables: Tables) -> list[str]:
@@ -283,14 +287,11 @@ def footnotes(tables: Tables) -> list[str]:
     for (checkpoint, tasks), _ in iqm[iqm["skipped"] != ""].groupby(["checkpoint", "skipped"]):
         lines.append(f"At {_steps(checkpoint)} not every variant has runs on {tasks}: interquartile means leave that out.")
     if len(better) < len(every):
-        lines.append(f"Probabilities of improvement between more than {MANY} variants: --json.")
+        lines.append(f"Of more than {MANY} variants the probabilities over the best one are shown, all by --json.")
     if better.groupby("checkpoint")["n_tasks"].nunique().gt(1).any():
         lines.append("Each probability is over the tasks that both variants have runs on, which are not the same for all.")
-    if (better["probability"].isin([0, 1]) & (better["low"] == better["high"])).any():
-        lines.append(
-            "An interval without width means only that no run of one variant is better than any of the other: two equal "
-            "variants look like that with a probability of 1/3 (two runs each on one task), 1/10 (three) or 1/126 (five)."
-        )
+    if better["p"].notna().any():
+        lines.append("p: Mann and Whitney's, two-sided.")
     if comparison["paper_mean"].notna().any():
         lines.append(
             f"Paper: table {number}. ▲ ▼: the difference from it is more than two standard errors of the difference, "
