@@ -5,7 +5,6 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 

@@ -252,8 +252,9 @@ def _statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
     for checkpoint, part in _few(better).groupby("checkpoint"):
         title = f"Probability that a run of the row is better than one of the column, at {_steps(checkpoint)}"
         cells = [
-            f"{row.probability:.2f} {_range(row.low, row.high, '.2f')}" + ("" if math.isnan(row.p) else f" p {row.p:.2g}")
-            for row in part.itertuples()
+            f"{row['probability']:.2f} {_range(row['low'], row['high'], '.2f')}"
+            + ("" if math.isnan(row["p"]) else f" p {row['p']:.2g}")
+            for row in part.to_dict("records")
         ]
         matrix = part.assign(cell=cells).pivot(index="variant", columns="over", values="cell").fillna("")
         variants = list(part["variant"].unique())
@@ -268,8 +269,8 @@ def _statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
 def _few(better: pd.DataFrame) -> pd.DataFrame:
     """The pairs that fit a page: of checkpoints with many variants those with the one that is best on average."""
     n_variants = better.groupby("checkpoint")["variant"].transform("nunique")
-    best = better.groupby(["checkpoint", "variant"])["probability"].mean().groupby("checkpoint").idxmax()
-    return better[(n_variants <= MANY) | pd.Series(zip(better["checkpoint"], better["over"]), better.index).isin(best)]
+    losses = better.groupby(["checkpoint", "over"])["probability"].transform("mean")
+    return better[(n_variants <= MANY) | (losses == losses.groupby(better["checkpoint"]).transform("min"))]
 
 
 def footnotes(tables: Tables) -> list[str]:
