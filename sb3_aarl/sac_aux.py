@@ -3,7 +3,6 @@
 import copy
 import logging
 import math
-import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -13,7 +12,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -220,7 +218,6 @@ class SACAux(SAC):
         self.precision = precision
         self.compile = compile
 
-        self._frame_stack: int | dict[str, int] | None = None  # of the env that the buffer was made for
         self.aux_head: AuxHead | None = None
         self.aux_optimizer: th.optim.Optimizer | None = None
         self._n_aux_skipped = 0
@@ -237,17 +234,20 @@ class SACAux(SAC):
         self._check_arguments()
         if self.replay_buffer_class is None:
             self.replay_buffer_class = WindowReplayBuffer
-        if self.replay_buffer_class is WindowReplayBuffer and self.replay_buffer is None:
-            self.replay_buffer = self._make_replay_buffer()
-        # load() compares policy_kwargs with those that were saved: they stay as the user gave them.
-        policy_kwargs = self.policy_kwargs
+        # load() compares policy_kwargs with those that were saved, and may set n_steps anew: they stay as the user gave them.
+        policy_kwargs, n_step = self.policy_kwargs, {}
         self.policy_kwargs = {"augmentation": self.augmentation, "crop_size": self.crop_size, **policy_kwargs}
         with warnings.catch_warnings():
             if self.replay_buffer_class is WindowReplayBuffer:
-                # SB3 expects that no buffer class but its own knows n-step returns.
-                warnings.filterwarnings("ignore", message="`n_steps=")
+                if self.env is not None:  # kept for load() without an environment, where there are no wrappers to look at
+                    self.replay_buffer_kwargs = {"frame_stack": detect_frame_stack(self.env), **self.replay_buffer_kwargs}
+                if self.n_steps > 1:  # SB3 expects that no buffer class but its own knows n-step returns
+                    warnings.filterwarnings("ignore", message="`n_steps=")
+                    n_step = {"n_steps": self.n_steps, "gamma": self.gamma}
+            replay_buffer_kwargs = self.replay_buffer_kwargs
+            self.replay_buffer_kwargs = replay_buffer_kwargs | n_step
             super()._setup_model()
-        self.policy_kwargs = policy_kwargs
+        self.policy_kwargs, self.replay_buffer_kwargs = policy_kwargs, replay_buffer_kwargs
 
         if self.ent_coef_optimizer is not None:
             assert self.log_ent_coef is not None
@@ -283,21 +283,6 @@ class SACAux(SAC):
             raise ValueError(
                 f"{buffer_class.__name__} has no windows, which aux_loss={self.aux_loss} needs: WindowReplayBuffer has"
             )
-
-    def _make_replay_buffer(self) -> WindowReplayBuffer:
-        # SB3's own check, for its own buffers only.
-        is_dict = isinstance(self.observation_space, spaces.Dict)
-        assert self.n_steps == 1 or not is_dict, "n-step returns are not supported for Dict observation spaces"
-        # Kept for load() without an environment, where there are no wrappers to look at.
-        if self.env is not None and "frame_stack" not in self.replay_buffer_kwargs:
-            self._frame_stack = detect_frame_stack(self.env)
-        kwargs: dict[str, Any] = {} if self._frame_stack is None else {"frame_stack": self._frame_stack}
-        kwargs |= self.replay_buffer_kwargs
-        if self.n_steps > 1:
-            kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}
-        return WindowReplayBuffer(
-            self.buffer_size, self.observation_space, self.action_space, self.device, self.n_envs, **kwargs
-        )
 
     def _setup_aux_loss(self) -> None:
         encoder = [parameter for parameter in self.critic.features_extractor.parameters() if parameter.requires_grad]
@@ -355,7 +340,6 @@ class SACAux(SAC):
         # Networks compute in bfloat16 if asked to; their outputs, and all that is computed from them, are float32.
         bf16 = self.precision == "bf16" and _computes_bf16(self.device)
         autocast = th.autocast(self.device.type, th.bfloat16, enabled=bf16)
-        started = time.perf_counter()
         with self._logged() as log:
             for _ in range(gradient_steps):
                 self._n_updates += 1
@@ -418,8 +402,6 @@ class SACAux(SAC):
                     self._update_target()
                 # Running statistics of the encoder are copied, see SB3's issue 996.
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-                if self.compile and self._n_updates == 1:
-                    logger.info("compile=True: the first gradient step took %.0f s", time.perf_counter() - started)
 
     def _act(self, observations: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
         """Actions of the actor and their log probabilities, (batch, action_dim) and (batch, 1)."""
@@ -456,23 +438,24 @@ class SACAux(SAC):
 
     def _sample(self, batch_size: int) -> tuple[ReplayBufferSamples, WindowSamples | None]:
         """Transitions and windows of one gradient step, images augmented; no windows as long as no episode has one."""
-        assert self.replay_buffer is not None
-        if type(self.replay_buffer) is WindowReplayBuffer:  # less to copy: augment() finds nothing left to crop
-            self.replay_buffer.crop_size = self.policy.crop_size if self.policy.crops else None
+        buffer, env, windows = self.replay_buffer, self._vec_normalize_env, None
         augment: Callable[[Any], Any] = self.policy.augment
-        env, n_windows = self._vec_normalize_env, self.aux_batch_size or batch_size
-        batch = self.replay_buffer.sample(batch_size, env)
+        assert buffer is not None
+        if isinstance(buffer, WindowReplayBuffer):  # less to copy: augment() finds nothing left to crop
+            buffer.crop_size = self.policy.crop_size if self.policy.crops else None
+        batch = buffer.sample(batch_size, env)
         batch = batch._replace(observations=augment(batch.observations), next_observations=augment(batch.next_observations))
-        if self.aux_head is None:
-            return batch, None
-        assert isinstance(self.replay_buffer, WindowReplayBuffer), "an auxiliary loss needs a WindowReplayBuffer"
-        horizon, offsets = self.aux_head.loss.horizon, self.aux_head.offsets
-        try:
-            windows = self.replay_buffer.sample_windows(n_windows, horizon, env, offsets)
-        except NoWindowError:
-            self._n_aux_skipped += 1
-            return batch, None
-        return batch, windows._replace(observations=augment(windows.observations))
+        if self.aux_head is not None:
+            assert isinstance(buffer, WindowReplayBuffer), "an auxiliary loss needs a WindowReplayBuffer"
+            horizon, offsets = self.aux_head.loss.horizon, self.aux_head.offsets
+            try:
+                windows = buffer.sample_windows(self.aux_batch_size or batch_size, horizon, env, offsets)
+                windows = windows._replace(observations=augment(windows.observations))
+            except NoWindowError:
+                self._n_aux_skipped += 1
+        if isinstance(buffer, WindowReplayBuffer):
+            buffer.crop_size = None  # a user's own sample() has whole images
+        return batch, windows
 
     def _backward_aux_loss(
         self, windows: WindowSamples | None, autocast: th.autocast, log: Callable[[str, th.Tensor], None]
@@ -546,7 +529,7 @@ class SACAux(SAC):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
-        tb_log_name: str = "SAC",
+        tb_log_name: str = "SACAux",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfSACAux:

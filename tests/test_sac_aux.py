@@ -619,7 +619,7 @@ def test_parameters_include_the_auxiliary_ones(joint: bool) -> None:
 
 def test_loading_with_other_n_step_returns(tmp_path: pathlib.Path) -> None:
     model = make_model(n_steps=3)
-    assert model.replay_buffer_kwargs == {} and model.replay_buffer.n_steps == 3
+    assert model.replay_buffer.n_steps == 3
     model.save(tmp_path / "model")
     loaded = SACAux.load(tmp_path / "model", make_env("state"), n_steps=2, gamma=0.5)
     assert (loaded.replay_buffer.n_steps, loaded.replay_buffer.gamma) == (2, 0.5)
@@ -690,6 +690,8 @@ def test_prediction_sees_the_centre_and_training_sees_any_crop(kind: str) -> Non
     corners = [set((images[:, 0, 0, 0] * 255).round().tolist()) for images in seen]
     assert set().union(*corners) == {10 * row + column for row in range(3) for column in range(5)}
     assert min(map(len, corners)) > 5  # each pass of an encoder sees crops of its own
+    images = model.replay_buffer.sample(2).observations
+    assert (images if kind == "pixels" else images["image"]).shape[2:] == (18, 20)  # a user's own sample has all
 
 
 @pytest.mark.parametrize("argument", [{"crop_size": 17}, {"augmentation": "random_shift"}, {"augmentation": "none"}])
@@ -741,7 +743,7 @@ def test_bad_arguments(kind: str, settings: dict[str, Any], message: str) -> Non
 
 def test_the_frame_stack_is_detected(tmp_path: pathlib.Path) -> None:
     stacked = make_model(env=VecFrameStack(make_env("state"), 2)).learn(30)
-    assert stacked.replay_buffer.stores[""].stack == 2 and "frame_stack" not in stacked.replay_buffer_kwargs
+    assert stacked.replay_buffer.stores[""].stack == 2
     stacked.save(tmp_path / "model")
     assert SACAux.load(tmp_path / "model").replay_buffer.stores[""].stack == 2  # without wrappers to look at
     with pytest.raises(ValueError, match=r"frame_stack=3 does not fit observations of shape \(3, 18, 20\)"):
