@@ -217,6 +217,16 @@ def test_the_distance_from_the_paper_on_walker_walk_is_that_of_the_action_repeat
     assert are_close(returns(*repeat_2, of=("aarl_state",)), returns("", "_orthogonal", of=("aarl_state",)))
 
 
+def test_the_distance_from_the_paper_on_cheetah_run_is_that_of_orthogonal_layers() -> None:
+    def distance(choice: str) -> float:
+        """In standard errors of the difference."""
+        runs = last_returns(f"sac_identity_small{choice}")
+        assert len(runs) == 5
+        return (237 - statistics.mean(runs)) / math.sqrt((statistics.variance(runs) + 27**2) / 5)
+
+    assert distance("") > 2 > max(distance("_orthogonal"), distance("_orthogonal_squashed"))
+
+
 def test_decisions_by_runs_with_orthogonal_layers() -> None:
     identity, orthogonal, squashed = (
         [last_returns(f"sac_identity_small{choice}", task) for task in TASKS]
@@ -267,6 +277,9 @@ def test_figures_of_the_first_readme() -> None:
     ):
         aarl, sac_dense = (shown(last_returns(f"{variant}_small", task)) for variant in ("aarl_state", "sac_dense_mlp"))
         assert text.format(aarl, sac_dense) in readme
+    identity, orthogonal = (shown(last_returns(f"sac_identity_small{choice}")) for choice in ("", "_orthogonal"))
+    start = "with layers that start orthogonal, as in the public code,"
+    assert f"SAC on the states gets {identity} on Cheetah-Run at that size, {start} {orthogonal}." in readme
     paper = paper_scores(4).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'").set_index("column")
     for text, variant, column in (
         ("AARL-State gets {} on Cheetah-Run, where the paper has {}", "aarl_state_bf16", "AARL-State"),

@@ -174,6 +174,8 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
 for name in ("aarl_state", "sac_dense_mlp", "sac_identity"):
     CHOICES[f"{name}_small_repeat_2"] = (name, {**SMALL, **REPEAT_2})
     CHOICES[f"{name}_small_orthogonal_squashed_repeat_2"] = (name, {**merge(SMALL, PUBLIC), **REPEAT_2})
+CHOICES["sac_identity_orthogonal_squashed_bf16"] = ("sac_identity", {**PUBLIC, "precision": "bf16"})
+CHOICES["sac_identity_orthogonal_squashed_repeat_2_bf16"] = ("sac_identity", {**PUBLIC, **REPEAT_2, "precision": "bf16"})
 EVOLUTION: dict[str, Any] = {"batch_size": 128, "learning_rate": 1e-3, "n_timesteps": 25_000, "precision": "bf16"}
 EVOLUTION["env_kwargs"] = {"fast_rendering": True}
 CHOICES["sac_pixel_128_bf16"] = ("sac_pixel", EVOLUTION)
