@@ -227,7 +227,7 @@ def _options(words: str, text: str) -> dict[str, Any]:
         horizon = re.fullmatch(r"horizon=([0-9]{1,4})", word)
         key = "operator" if word in OPERATORS else "horizon" if horizon else word
         if key not in ("operator", "negatives", "horizon") or key in options:
-            raise ValueError(f"{word!r} is no operator, 'negatives' or 'horizon=k', each once only: {text!r}")
+            raise ValueError(f"{word!r} is none of {', '.join(OPERATORS)}, negatives, horizon=k, each once only: {text!r}")
         options[key] = int(horizon[1]) if horizon else word if key == "operator" else True
     return options
 

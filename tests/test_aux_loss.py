@@ -155,9 +155,9 @@ def test_arguments_and_brackets() -> None:
         ("{,s_t} -> {s_t}", "'' is no token"),
         ("{s_t+} -> {s_t}", r"'s_t\+' is no token"),
         ("{s_t, s_{t+0}} -> {s_t}", "s_t is there twice"),
-        ("{s_t} -> {s_t} [huber]", "'huber' is no operator"),
+        ("{s_t} -> {s_t} [huber]", "'huber' is none of .*bilinear.*, negatives, horizon=k"),
         ("{s_t} -> {s_t} [mse, cosine]", "'cosine' is .* each once only"),
-        ("{s_t} -> {s_t} []", "'' is no operator"),
+        ("{s_t} -> {s_t} []", "'' is none of "),
     ],
 )
 def test_what_cannot_be_read_is_named(text: str, problem: str) -> None:
