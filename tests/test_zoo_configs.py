@@ -219,6 +219,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba/forward_simba_repeat_4": FINALIST | {"aux_loss": "forward-dynamics"},
     "forward_simba": simba(64)
     | {"aux_loss": "forward-dynamics", "learning_starts": 5000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4},
+    "simba/published_simba": FINALIST | {"aux_loss": "cheetah-run-state-3-1"},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/sac_states": {"aux_loss": None, "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}},
     "simba/aarl_dense_mlp": PAPERS,
