@@ -234,7 +234,7 @@ class SACAux(SAC):
         self._check_arguments()
         if self.replay_buffer_class is None:
             self.replay_buffer_class = WindowReplayBuffer
-        # load() compares policy_kwargs with those that were saved, and may set n_steps anew: they stay as the user gave them.
+        # load() compares policy_kwargs with those that were saved, and may change n_steps: they stay as the user gave them.
         policy_kwargs, n_step = self.policy_kwargs, {}
         self.policy_kwargs = {"augmentation": self.augmentation, "crop_size": self.crop_size, **policy_kwargs}
         with warnings.catch_warnings():

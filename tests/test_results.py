@@ -212,7 +212,9 @@ def test_the_distance_from_the_paper_on_walker_walk_is_that_of_the_action_repeat
 
     repeat_2 = ("_repeat_2", "_orthogonal_squashed_repeat_2")
     assert max(returns("")) < min(returns("_repeat_2"))
-    assert max(returns("_orthogonal", "_orthogonal_squashed")) < min(returns("_orthogonal_squashed_repeat_2"))
+    identity, started = (returns(change, of=("sac_identity",)) for change in repeat_2)
+    assert statistics.mean(started) <= statistics.mean(identity)
+    assert sum(value < max(returns("_orthogonal", "_orthogonal_squashed")) for value in returns(repeat_2[1])) == 1
     assert are_close(returns(*repeat_2), returns(*repeat_2, of=("aarl_state",)))
     assert are_close(returns(*repeat_2, of=("aarl_state",)), returns("", "_orthogonal", of=("aarl_state",)))
 
@@ -255,7 +257,7 @@ def test_figures_of_the_first_readme() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     sac = {
         "cheetah-run": last_returns("sac_identity_small"),
-        **{task: last_returns("sac_starts_5000", task, "simba") for task in ("HalfCheetah-v5", "Hopper-v5")},
+        **{task: last_returns("sac_starts_5000", task, "simba") for task in ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5")},
     }
     forward = {"cheetah-run": last_returns("forward_simba", folder="simba_cheetah_run")}
     for path in (RESULTS / "simba" / "forward_simba").iterdir():
