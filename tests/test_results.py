@@ -257,7 +257,10 @@ def test_figures_of_the_first_readme() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     sac = {
         "cheetah-run": last_returns("sac_identity_small"),
-        **{task: last_returns("sac_starts_5000", task, "simba") for task in ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5")},
+        **{
+            path.name: last_returns("sac_starts_5000", path.name, "simba")
+            for path in (RESULTS / "simba/sac_starts_5000").iterdir()
+        },
     }
     forward = {"cheetah-run": last_returns("forward_simba", folder="simba_cheetah_run")}
     for path in (RESULTS / "simba" / "forward_simba").iterdir():
