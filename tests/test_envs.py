@@ -1,6 +1,8 @@
 """DeepMind Control through shimmy: every task against dm_control itself, stepped by hand, and the pictures."""
 
 import os
+import subprocess
+import sys
 import warnings
 from typing import Any
 
@@ -205,3 +207,11 @@ def test_a_renderer_is_chosen_where_there_is_no_display(
         monkeypatch.setenv(name, value)
     envs._choose_renderer()
     assert os.environ.get("MUJOCO_GL") in expected
+
+
+def test_deprecations_of_libraries_stay_hidden() -> None:
+    """dm_control has Python show them all, each time, from its import on."""
+    program = "import warnings; from sb3_aarl.envs import make_dmc_env; make_dmc_env('walker-walk')"
+    program += "; warnings.warn_explicit('old', DeprecationWarning, 'library.py', 1)"
+    process = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, check=True)
+    assert "old" not in process.stderr
