@@ -187,9 +187,10 @@ def are_close(one: list[float], other: list[float]) -> bool:
     return abs(statistics.mean(one) - statistics.mean(other)) < 2 * error
 
 
-def papers_on_cheetah_run() -> pd.DataFrame:
-    """The paper's table 4 at 100,000 steps by column."""
-    return paper_scores(4).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'").set_index("column")
+def papers_on_cheetah_run(table: int = 4) -> pd.DataFrame:
+    """A table of the paper at 100,000 steps by column."""
+    scores = paper_scores(table).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'")
+    return scores.set_index("column")
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -299,3 +300,23 @@ def test_figures_of_the_first_readme() -> None:
         score = paper.loc[column]
         papers = f"{score['mean']:.0f} ± {score['std']:.0f}"
         assert text.format(shown(last_returns(variant, folder="choices")), papers) in readme
+    started = last_returns("sac_identity_orthogonal_squashed_bf16", folder="choices")
+    assert f"and {shown(started)} (two seeds) where actor and critic start as in the public code" in readme
+    assert len(started) == 2 and min(started) > max(last_returns("sac_identity_bf16", folder="choices"))
+
+
+def test_from_pixels() -> None:
+    readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
+
+    def curve(variant: str) -> dict[int, float]:
+        points = read_curve(RESULTS / "pixels" / f"{variant}_pixel_128_bf16" / "cheetah-run" / "seed-0" / "curve.csv")
+        return {point.environment_steps: point.mean for point in points}
+
+    aarl, curl, sac = (curve(variant) for variant in ("aarl", "curl", "sac"))
+    returns = (returns[60_000] for returns in (aarl, curl, sac))
+    assert "AARL-Pixel {:.0f}, CURL {:.0f}, SAC with random crops {:.0f};".format(*returns) in readme
+    assert all(aarl[steps] > curl[steps] for steps in aarl if steps >= 40_000)
+    assert max(aarl[20_000], curl[20_000]) < 14 < sac[20_000]
+    paper = papers_on_cheetah_run(3)
+    papers = ("{mean:.0f} ± {std:.0f}".format(**paper.loc[column]) for column in ("AARL-Pixel", "CURL"))
+    assert "the paper has {} and {} for the first two after 100,000".format(*papers) in readme
