@@ -4,10 +4,13 @@ import json
 import re
 import subprocess
 import sys
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from executors import InProcess
 from tiny import YAML
 
 from sb3_aarl.callbacks import Evaluation, aulc, read_curve, write_curve
@@ -16,6 +19,7 @@ from search.execution.runs import LocalExecutor
 from search.results import table
 from search.studies import benchmark
 from search.studies.benchmark import load_benchmark, parse_seeds, parse_steps, read_abouts, read_curves
+from search.studies.status import matrix_status
 from search.training import provenance
 from search.training.config import load_hyperparameters
 from search.training.provenance import ABOUT, read_about, write_about
@@ -170,6 +174,34 @@ def test_runs_that_were_copied_together_are_compared_only_if_trained_alike(folde
         read_abouts(Path("out"))
     with pytest.raises(ValueError, match="no learning curves"):
         read_curves(folder / "nowhere")
+
+
+def test_the_time_to_go_is_that_of_the_steps_that_are_left(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter([0.0, 10.0, 20.0])
+    monkeypatch.setattr("search.execution.matrix.time", SimpleNamespace(monotonic=lambda: next(seconds), sleep=lambda _: None))
+    matrix = load("mine.yml", seeds=[0, 1], checkpoints=[80], every=20)
+    paths = [cell_folder(Path("out"), cell) for cell in matrix.runs]
+    futures: list[Future[Any]] = []
+
+    class Waiting(InProcess):
+        def submit(self, fn: Any, path: str) -> "Future[Any]":
+            futures.append(Future())
+            return futures[-1]
+
+    def evaluate(path: Path, *steps: int) -> list[Evaluation]:
+        write_curve(path / "curve.csv", curve := [Evaluation(step, 0.0, 0.0, 1, 1.0) for step in steps])
+        return curve
+
+    paths[0].mkdir(parents=True)
+    evaluate(paths[0], 20)  # of an earlier session
+    progress = run_matrix(matrix, Waiting(), workers=1)
+    assert next(progress).seconds_to_go is None
+    evaluate(paths[0], 20, 40)
+    assert next(progress).seconds_to_go == pytest.approx(10 * 1.5 / 0.25)
+    assert matrix_status(Path("out"))[1] == pytest.approx(1 / 0.5 * 1.5)
+    curve = evaluate(paths[0], 20, 40, 60, 80)
+    futures[0].set_result({"curve": [list(point) for point in curve], "failure": None, "retry": False})
+    assert next(progress)[1:] == (1, 0, pytest.approx(20 / 0.75))
 
 
 @pytest.mark.slow

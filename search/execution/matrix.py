@@ -15,7 +15,7 @@ from sb3_aarl.callbacks import aulc, replace_text
 from sb3_aarl.envs import PREFIX
 from search.execution.runs import Executor, Submission
 from search.training.provenance import ABOUT, read_about, write_about
-from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run
+from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run, read_run
 
 POLL_SECONDS = 0.5
 
@@ -81,7 +81,8 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
         if (before := read_about(path)) != before | about:
             write_about(path, before | about)
     waiting = [cell for cell in matrix.runs if not is_finished(cell_folder(matrix.folder, cell))]
-    n_waiting, started = len(waiting), time.monotonic()
+    shares = {cell: share_left(cell_folder(matrix.folder, cell)) for cell in waiting}
+    planned, started = sum(shares.values()), time.monotonic()
     in_flight: dict[Cell, Submission] = {}
     failed: set[Cell] = set()
     while waiting or in_flight:
@@ -90,19 +91,26 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
             in_flight[cell] = Submission(executor, cell_folder(matrix.folder, cell), matrix.runs[cell], retries)
         for cell in [cell for cell, submission in in_flight.items() if submission.done()]:
             submission = in_flight.pop(cell)
+            del shares[cell]
             if submission.failure is not None and not is_finished(submission.folder):
                 failed.add(cell)
                 if not (submission.folder / FAILED).exists():  # its process could not write it
                     note = {"reason": submission.failure, "retry": True}
                     replace_text(submission.folder / FAILED, json.dumps(note) + "\n")
-        left = len(waiting) + len(in_flight)
-        over = n_waiting - left
-        to_go = (time.monotonic() - started) / over * left if over else None
-        yield MatrixProgress(len(matrix.runs), len(matrix.runs) - left - len(failed), len(failed), to_go)
-        if left:
+        shares |= {cell: share_left(submission.folder) for cell, submission in in_flight.items()}
+        left = sum(shares.values())
+        to_go = (time.monotonic() - started) / (planned - left) * left if left < planned else None
+        yield MatrixProgress(len(matrix.runs), len(matrix.runs) - len(shares) - len(failed), len(failed), to_go)
+        if shares:
             time.sleep(POLL_SECONDS)
-    if not n_waiting:
+    if not planned:
         yield MatrixProgress(len(matrix.runs), len(matrix.runs), 0, 0.0)
+
+
+def share_left(folder: Path) -> float:
+    """The share of a run's environment steps that are after its last evaluation."""
+    curve = partial_curve(folder)
+    return 1 - curve[-1].environment_steps / read_run(folder).checkpoints[-1] if curve else 1.0
 
 
 def scores(matrix: Matrix) -> pd.DataFrame:

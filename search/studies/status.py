@@ -1,6 +1,7 @@
 """How far a search with the matrices in its folder is, or a benchmark. Nothing is started."""
 
 import inspect
+import math
 from pathlib import Path
 
 import optuna
@@ -11,9 +12,10 @@ from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import aulc
 from search.evolution.sampler import AuxLossSampler
 from search.execution import driver
+from search.execution.matrix import share_left
 from search.studies.search import SETTINGS_KEY
 from search.training.provenance import read_about
-from search.training.run import LOCK, RUN, read_outcome
+from search.training.run import LOCK, RUN, partial_curve, read_outcome
 
 # Folders of matrices in that of a search.
 PARTS = ("baselines", "cross-validation", "operators")
@@ -35,23 +37,23 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     """
     rows = []
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
-        outcome = read_outcome(path)
+        outcome, curve, left = read_outcome(path), partial_curve(path), share_left(path)
         row = {"variant": read_about(path)["variant"], "task": path.parent.name, "done": 0, "running": 0, "failed": 0}
         if outcome is None:
-            row["running"] = is_locked(path / LOCK)
+            row |= {"running": is_locked(path / LOCK), "left": left}
         elif outcome.failure is not None:
             row["failed"] = 1
         else:
-            row |= {"done": 1, "score": aulc(outcome.curve), "seconds": outcome.curve[-1].seconds}
-        rows.append(row)
-    runs = pd.DataFrame(rows, columns=["variant", "task", "done", "running", "failed", "score", "seconds"])
+            row |= {"done": 1, "score": aulc(curve)}
+        rows.append(row | ({"seconds": curve[-1].seconds / (1 - left)} if curve else {}))
+    runs = pd.DataFrame(rows, columns=["variant", "task", "done", "running", "failed", "left", "score", "seconds"])
     by_variant = runs.groupby("variant", sort=False)
     table = by_variant[["done", "running", "failed"]].sum().astype(int)
     table.insert(0, "runs", by_variant.size())
     table["score"] = by_variant["score"].mean().where(by_variant["task"].nunique() == 1)
-    left = len(runs) - runs["done"].sum() - runs["failed"].sum()
-    to_go = runs["seconds"].mean() * left / max(1, runs["running"].sum())
-    return table.reset_index(), 0.0 if not left else float(to_go) if runs["done"].any() else None
+    # A run's seconds at the pace that it had so far.
+    to_go = runs["seconds"].mean() * runs["left"].sum() / max(1, runs["running"].sum())
+    return table.reset_index(), 0.0 if runs["left"].isna().all() else None if math.isnan(to_go) else float(to_go)
 
 
 def is_locked(path: Path) -> bool:
