@@ -346,6 +346,7 @@ def test_learning_rates_that_fall(tmp_path: Path) -> None:
 def test_wrappers_are_in_training_and_evaluation(tmp_path: Path) -> None:
     wrappers = ["ClipAction", {"gymnasium.wrappers.time_limit.TimeLimit": {"max_episode_steps": 8}}]
     setup = module.Setup(make_run(hyperparameters=DENSE | {"env_wrapper": wrappers}), "here")
+    assert setup.episode_steps == 8
     for env in (setup.training_env(), setup.evaluation_env()):
         env.reset()
         assert [bool(env.step(np.array([[0.0]] * env.num_envs))[2][0]) for _ in range(8)] == [False] * 7 + [True]

@@ -50,10 +50,17 @@ def _loss_or_none(value: Any) -> AuxLoss | None:
     return None if value in (None, "none") else catalog.resolve(value)
 
 
+def _without_loss(overrides: dict[str, Any]) -> dict[str, Any]:
+    if "aux_loss" in overrides:
+        raise ValueError("aux_loss is none of them: a search finds its losses, that of a baseline stands beside them")
+    return overrides
+
+
 Environment = Annotated[str, AfterValidator(training.resolve_env_id)]
 Environments = Annotated[tuple[Environment, ...], AfterValidator(_different)]
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0, lt=2**32)], ...], AfterValidator(_different)]
 Checkpoints = Annotated[tuple[PositiveInt, ...], AfterValidator(_ascending)]
+Overrides = Annotated[dict[str, Any], AfterValidator(_without_loss)]
 
 
 class CrossValidation(BaseModel, frozen=True, extra="forbid"):
@@ -85,14 +92,7 @@ class Baseline(BaseModel, frozen=True, extra="forbid"):
 
     name: str
     aux_loss: Annotated[AuxLoss | None, PlainValidator(_loss_or_none)] = None
-    overrides: dict[str, Any] = {}
-
-    @field_validator("overrides")
-    @classmethod
-    def _without_loss(cls, overrides: dict[str, Any]) -> dict[str, Any]:
-        if "aux_loss" in overrides:
-            raise ValueError("aux_loss stands beside them")
-        return overrides
+    overrides: Overrides = {}
 
 
 class SearchConfig(BaseModel, frozen=True, extra="forbid"):
@@ -149,7 +149,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     cross_validation: CrossValidation | None = None
     operator_selection: OperatorSelection | None = None
     baselines: tuple[Baseline, ...] = ()
-    overrides: dict[str, Any] = {}
+    overrides: Overrides = {}
 
     @field_validator("hyperparameters")
     @classmethod

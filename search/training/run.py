@@ -238,7 +238,10 @@ class Setup:
         self.settings = settings | {"aux_loss": run.aux_loss, "seed": run.seed}
 
         of_dmc = run.environment.startswith(PREFIX)
-        self.episode_steps = EPISODE_LENGTH if of_dmc else gym.spec(run.environment).max_episode_steps
+        limits = [EPISODE_LENGTH if of_dmc else gym.spec(run.environment).max_episode_steps]
+        for _, name, arguments in env_wrappers(self.env_wrapper):
+            limits += [arguments["max_episode_steps"] * self.action_repeat] if name == "TimeLimit" else []
+        self.episode_steps = min((limit for limit in limits if limit is not None), default=None)
 
     def _make(self, steps: Sequence[int] = ()) -> Callable[[], gym.Env]:
         run = self.run
