@@ -4,18 +4,18 @@ import hashlib
 import json
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 
-from sb3_aarl.callbacks import aulc, replace_text
+from sb3_aarl.callbacks import Evaluation, aulc, replace_text
 from sb3_aarl.envs import PREFIX
 from search.execution.runs import Executor, Submission
 from search.training.provenance import ABOUT, read_about, write_about
-from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run, read_run
+from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run
 
 POLL_SECONDS = 0.5
 
@@ -81,7 +81,7 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
         if (before := read_about(path)) != before | about:
             write_about(path, before | about)
     waiting = [cell for cell in matrix.runs if not is_finished(cell_folder(matrix.folder, cell))]
-    shares = {cell: share_left(cell_folder(matrix.folder, cell)) for cell in waiting}
+    shares = {cell: share_left(partial_curve(cell_folder(matrix.folder, cell)), matrix.runs[cell]) for cell in waiting}
     planned, started = sum(shares.values()), time.monotonic()
     in_flight: dict[Cell, Submission] = {}
     failed: set[Cell] = set()
@@ -97,7 +97,7 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
                 if not (submission.folder / FAILED).exists():  # its process could not write it
                     note = {"reason": submission.failure, "retry": True}
                     replace_text(submission.folder / FAILED, json.dumps(note) + "\n")
-        shares |= {cell: share_left(submission.folder) for cell, submission in in_flight.items()}
+        shares |= {cell: share_left(partial_curve(running.folder), running.run) for cell, running in in_flight.items()}
         left = sum(shares.values())
         to_go = (time.monotonic() - started) / (planned - left) * left if left < planned else None
         yield MatrixProgress(len(matrix.runs), len(matrix.runs) - len(shares) - len(failed), len(failed), to_go)
@@ -107,10 +107,9 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
         yield MatrixProgress(len(matrix.runs), len(matrix.runs), 0, 0.0)
 
 
-def share_left(folder: Path) -> float:
+def share_left(curve: Sequence[Evaluation], run: Run) -> float:
     """The share of a run's environment steps that are after its last evaluation."""
-    curve = partial_curve(folder)
-    return 1 - curve[-1].environment_steps / read_run(folder).checkpoints[-1] if curve else 1.0
+    return 1 - curve[-1].environment_steps / run.checkpoints[-1] if curve else 1.0
 
 
 def scores(matrix: Matrix) -> pd.DataFrame:

@@ -15,7 +15,7 @@ from search.execution import driver
 from search.execution.matrix import share_left
 from search.studies.search import SETTINGS_KEY
 from search.training.provenance import read_about
-from search.training.run import LOCK, RUN, partial_curve, read_outcome
+from search.training.run import LOCK, RUN, partial_curve, read_outcome, read_run
 
 # Folders of matrices in that of a search.
 PARTS = ("baselines", "cross-validation", "operators")
@@ -37,7 +37,9 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     """
     rows = []
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
-        outcome, curve, left = read_outcome(path), partial_curve(path), share_left(path)
+        outcome = read_outcome(path)
+        curve = partial_curve(path) if outcome is None else outcome.curve
+        left = share_left(curve, read_run(path))
         row = {"variant": read_about(path)["variant"], "task": path.parent.name, "done": 0, "running": 0, "failed": 0}
         if outcome is None:
             row |= {"running": is_locked(path / LOCK), "left": left}
