@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from executors import InProcess
 from tiny import YAML
 
 from sb3_aarl.callbacks import Evaluation, aulc, read_curve, write_curve
@@ -181,12 +180,7 @@ def test_the_time_to_go_is_that_of_the_steps_that_are_left(folder: Path, monkeyp
     monkeypatch.setattr("search.execution.matrix.time", SimpleNamespace(monotonic=lambda: next(seconds), sleep=lambda _: None))
     matrix = load("mine.yml", seeds=[0, 1], checkpoints=[80], every=20)
     paths = [cell_folder(Path("out"), cell) for cell in matrix.runs]
-    futures: list[Future[Any]] = []
-
-    class Waiting(InProcess):
-        def submit(self, fn: Any, path: str) -> "Future[Any]":
-            futures.append(Future())
-            return futures[-1]
+    future: Future[Any] = Future()
 
     def evaluate(path: Path, *steps: int) -> list[Evaluation]:
         write_curve(path / "curve.csv", curve := [Evaluation(step, 0.0, 0.0, 1, 1.0) for step in steps])
@@ -194,13 +188,13 @@ def test_the_time_to_go_is_that_of_the_steps_that_are_left(folder: Path, monkeyp
 
     paths[0].mkdir(parents=True)
     evaluate(paths[0], 20)  # of an earlier session
-    progress = run_matrix(matrix, Waiting(), workers=1)
+    progress = run_matrix(matrix, SimpleNamespace(submit=lambda *_: future), workers=1)
     assert next(progress).seconds_to_go is None
     evaluate(paths[0], 20, 40)
     assert next(progress).seconds_to_go == pytest.approx(10 * 1.5 / 0.25)
     assert matrix_status(Path("out"))[1] == pytest.approx(1 / 0.5 * 1.5)
     curve = evaluate(paths[0], 20, 40, 60, 80)
-    futures[0].set_result({"curve": [list(point) for point in curve], "failure": None, "retry": False})
+    future.set_result({"curve": [list(point) for point in curve], "failure": None, "retry": False})
     assert next(progress)[1:] == (1, 0, pytest.approx(20 / 0.75))
 
 

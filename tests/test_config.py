@@ -408,6 +408,11 @@ def test_arguments_of_an_encoder_are_those_of_the_one_that_is_chosen(encoder: st
     assert refused == (["n_filters"] if encoder == "mlp" else ["width", "n_filters"])
 
 
+def test_an_unknown_loss_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"here: aux_loss: .*no-such-loss"):
+        check_hyperparameters({"aux_loss": "no-such-loss"}, "Pendulum-v1", "here")
+
+
 def test_arguments_of_an_environment_are_those_of_its_wrapper() -> None:
     values = {"env_kwargs": {"image_size": 84}}
     assert check_hyperparameters(values, "dm_control/cheetah-run-v0", "here") == values
