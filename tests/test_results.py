@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
 from scipy.stats import mannwhitneyu
 from typer.testing import CliRunner
@@ -187,10 +186,10 @@ def are_close(one: list[float], other: list[float]) -> bool:
     return abs(statistics.mean(one) - statistics.mean(other)) < 2 * error
 
 
-def papers_on_cheetah_run(table: int = 4) -> pd.DataFrame:
-    """A table of the paper at 100,000 steps by column."""
-    scores = paper_scores(table).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'")
-    return scores.set_index("column")
+def papers(column: str, task: str = "cheetah-run", table: int = 4) -> dict[str, float]:
+    """A score of the paper at 100,000 steps."""
+    scores = paper_scores(table).query(f"checkpoint == 100_000 and environment == 'dm_control/{task}-v0'")
+    return scores.set_index("column").loc[column].to_dict()
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -227,7 +226,7 @@ def test_the_distance_from_the_paper_on_walker_walk_is_that_of_the_action_repeat
 
 
 def test_the_distance_from_the_paper_on_cheetah_run_is_that_of_orthogonal_layers_and_squashed_deviation() -> None:
-    paper = papers_on_cheetah_run().loc["SAC-Identity"]
+    paper = papers("SAC-Identity")
 
     def distance(choice: str) -> float:
         """In standard errors of the difference."""
@@ -292,17 +291,18 @@ def test_figures_of_the_first_readme() -> None:
     identity, orthogonal, squashed = (shown(last_returns(f"sac_identity_small{choice}")) for choice in choices)
     start = f"with layers that start orthogonal {orthogonal}, with a squashed deviation too, as in the public code, {squashed}"
     assert f"SAC on the states gets {identity} on Cheetah-Run at that size, {start}." in readme
-    paper = papers_on_cheetah_run()
+    form = "{mean:.0f} ± {std:.0f}"
     for text, variant, column in (
         ("AARL-State gets {} on Cheetah-Run, where the paper has {}", "aarl_state_bf16", "AARL-State"),
         ("SAC on the states {}, where the paper has {}", "sac_identity_bf16", "SAC-Identity"),
     ):
-        score = paper.loc[column]
-        papers = f"{score['mean']:.0f} ± {score['std']:.0f}"
-        assert text.format(shown(last_returns(variant, folder="choices")), papers) in readme
+        assert text.format(shown(last_returns(variant, folder="choices")), form.format(**papers(column))) in readme
     started = last_returns("sac_identity_orthogonal_squashed_bf16", folder="choices")
     assert f"and {shown(started)} (two seeds) where actor and critic start as in the public code" in readme
     assert len(started) == 2 and min(started) > max(last_returns("sac_identity_bf16", folder="choices"))
+    walker = last_returns("sac_identity_orthogonal_squashed_repeat_2_bf16", "walker-walk", "choices")
+    text = "on Walker-Walk, with the public code's action repeat too, {} (two seeds), where the paper has {}."
+    assert len(walker) == 2 and text.format(shown(walker), form.format(**papers("SAC-Identity", "walker-walk"))) in readme
 
 
 def test_from_pixels() -> None:
@@ -317,6 +317,5 @@ def test_from_pixels() -> None:
     assert "AARL-Pixel {:.0f}, CURL {:.0f}, SAC with random crops {:.0f};".format(*returns) in readme
     assert all(aarl[steps] > curl[steps] for steps in aarl if steps >= 40_000)
     assert max(aarl[20_000], curl[20_000]) < 14 < sac[20_000]
-    paper = papers_on_cheetah_run(3)
-    papers = ("{mean:.0f} ± {std:.0f}".format(**paper.loc[column]) for column in ("AARL-Pixel", "CURL"))
-    assert "the paper has {} and {} for the first two after 100,000".format(*papers) in readme
+    paper = ("{mean:.0f} ± {std:.0f}".format(**papers(column, table=3)) for column in ("AARL-Pixel", "CURL"))
+    assert "the paper has {} and {} for the first two after 100,000".format(*paper) in readme
