@@ -287,22 +287,23 @@ def test_figures_of_the_first_readme() -> None:
     ):
         aarl, sac_dense = (shown(last_returns(f"{variant}_small", task)) for variant in ("aarl_state", "sac_dense_mlp"))
         assert text.format(aarl, sac_dense) in readme
-    choices = ("", "_orthogonal", "_orthogonal_squashed")
-    identity, orthogonal, squashed = (shown(last_returns(f"sac_identity_small{choice}")) for choice in choices)
-    start = f"with layers that start orthogonal {orthogonal}, with a squashed deviation too, as in the public code, {squashed}"
-    assert f"SAC on the states gets {identity} on Cheetah-Run at that size, {start}." in readme
     form = "{mean:.0f} ± {std:.0f}"
-    for text, variant, column in (
-        ("AARL-State gets {} on Cheetah-Run, where the paper has {}", "aarl_state_bf16", "AARL-State"),
-        ("SAC on the states {}, where the paper has {}", "sac_identity_bf16", "SAC-Identity"),
+    aarl, paper = shown(last_returns("aarl_state_bf16", folder="choices")), form.format(**papers("AARL-State"))
+    assert f"AARL-State gets {aarl} on Cheetah-Run, where the paper has {paper}." in readme
+    for row, choice in (
+        ("as SB3 starts, action repeat 4", ""),
+        ("layers start orthogonal", "_orthogonal"),
+        ("and the deviation is squashed", "_orthogonal_squashed"),
+        ("action repeat 2 alone", "_repeat_2"),
+        ("all three", "_orthogonal_squashed_repeat_2"),
     ):
-        assert text.format(shown(last_returns(variant, folder="choices")), form.format(**papers(column))) in readme
-    started = last_returns("sac_identity_orthogonal_squashed_bf16", folder="choices")
-    assert f"and {shown(started)} (two seeds) where actor and critic start as in the public code" in readme
-    assert len(started) == 2 and min(started) > max(last_returns("sac_identity_bf16", folder="choices"))
-    walker = last_returns("sac_identity_orthogonal_squashed_repeat_2_bf16", "walker-walk", "choices")
-    text = "on Walker-Walk, with the public code's action repeat too, {} (two seeds), where the paper has {}."
-    assert len(walker) == 2 and text.format(shown(walker), form.format(**papers("SAC-Identity", "walker-walk"))) in readme
+        sizes = ((f"sac_identity_small{choice}", "choices_small"), (f"sac_identity{choice}_bf16", "choices"))
+        cells = [with_seeds(last_returns(variant, task, folder)) for task in TASKS for variant, folder in sizes]
+        assert " | ".join([f"| {row}", *cells]) + " |" in readme
+    cheetah, walker = (f"{form.format(**papers('SAC-Identity', task))} | " * 2 for task in TASKS)
+    assert f"| the paper (10) | {cheetah}{walker}".strip() in readme
+    started, others = (last_returns(f"sac_identity{start}_bf16", folder="choices") for start in ("_orthogonal_squashed", ""))
+    assert min(started) > max(others)
 
 
 def test_from_pixels() -> None:
