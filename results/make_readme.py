@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import read_curve
 from search.cli.main import app
-from search.execution.matrix import comparable, stored_scores
+from search.execution.matrix import stored_scores
 from search.execution.storage import STUDY_FILE, load_study, open_storage
 from search.results.analysis import analysed, trial_table
 from search.results.table import closest_table, paper_scores
@@ -152,7 +152,7 @@ def search_section(folder: Path, results: Path) -> Iterator[str]:
     yield ""
     yield from printed(f"aarl analyze {name}", results)
     for part in ("baselines", "cross-validation"):
-        runs = comparable(stored_scores(folder / part))
+        runs = stored_scores(folder / part)
         if not runs.empty:
             yield f"{part.capitalize()}, AULC:\n"
             yield from block(ranking(runs).round(1).to_string())
