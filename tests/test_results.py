@@ -36,6 +36,7 @@ RESULTS = Path(__file__).parent.parent / "results"
 make_readme: dict[str, Any] = runpy.run_path(str(RESULTS / "make_readme.py"))
 SESSION = {"commit": "c0ffee", "cpu": "a processor", "gpu": "none", "date": "2026-11-21T12:00:00", "threads": 2}
 TASKS = ("cheetah-run", "walker-walk")
+SCORE = "{mean:.0f} ± {std:.0f}"
 
 
 @pytest.fixture(autouse=True)
@@ -287,8 +288,7 @@ def test_figures_of_the_first_readme() -> None:
     ):
         aarl, sac_dense = (shown(last_returns(f"{variant}_small", task)) for variant in ("aarl_state", "sac_dense_mlp"))
         assert text.format(aarl, sac_dense) in readme
-    form = "{mean:.0f} ± {std:.0f}"
-    aarl, paper = shown(last_returns("aarl_state_bf16", folder="choices")), form.format(**papers("AARL-State"))
+    aarl, paper = shown(last_returns("aarl_state_bf16", folder="choices")), SCORE.format(**papers("AARL-State"))
     assert f"AARL-State gets {aarl} on Cheetah-Run, where the paper has {paper}." in readme
     for row, choice in (
         ("as SB3 starts, action repeat 4", ""),
@@ -300,7 +300,7 @@ def test_figures_of_the_first_readme() -> None:
         sizes = ((f"sac_identity_small{choice}", "choices_small"), (f"sac_identity{choice}_bf16", "choices"))
         cells = [with_seeds(last_returns(variant, task, folder)) for task in TASKS for variant, folder in sizes]
         assert " | ".join([f"| {row}", *cells]) + " |" in readme
-    cheetah, walker = (f"{form.format(**papers('SAC-Identity', task))} | " * 2 for task in TASKS)
+    cheetah, walker = (f"{SCORE.format(**papers('SAC-Identity', task))} | " * 2 for task in TASKS)
     assert f"| the paper (10) | {cheetah}{walker}".strip() in readme
     started, others = (last_returns(f"sac_identity{start}_bf16", folder="choices") for start in ("_orthogonal_squashed", ""))
     assert min(started) > max(others)
@@ -318,5 +318,5 @@ def test_from_pixels() -> None:
     assert "AARL-Pixel {:.0f}, CURL {:.0f}, SAC with random crops {:.0f};".format(*returns) in readme
     assert all(aarl[steps] > curl[steps] for steps in aarl if steps >= 40_000)
     assert max(aarl[20_000], curl[20_000]) < 14 < sac[20_000]
-    paper = ("{mean:.0f} ± {std:.0f}".format(**papers(column, table=3)) for column in ("AARL-Pixel", "CURL"))
+    paper = (SCORE.format(**papers(column, table=3)) for column in ("AARL-Pixel", "CURL"))
     assert "the paper has {} and {} for the first two after 100,000".format(*paper) in readme
