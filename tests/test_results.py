@@ -302,8 +302,9 @@ def test_figures_of_the_first_readme() -> None:
         assert " | ".join([f"| {row}", *cells]) + " |" in readme
     cheetah, walker = (f"{SCORE.format(**papers('SAC-Identity', task))} | " * 2 for task in TASKS)
     assert f"| the paper (10) | {cheetah}{walker}".strip() in readme
-    started, others = (last_returns(f"sac_identity{start}_bf16", folder="choices") for start in ("_orthogonal_squashed", ""))
-    assert min(started) > max(others)
+    fp32, both, none = (last_returns(f"sac_identity{x}", folder="choices") for x in ("", "_orthogonal_squashed_bf16", "_bf16"))
+    assert min(fp32) > max(both) and min(both) > max(none)
+    assert f"| and in float32 | - | {with_seeds(fp32)} | - | - |" in readme
 
 
 def test_from_pixels() -> None:
