@@ -25,6 +25,7 @@ from search.results.table import closest_table, paper_scores
 from search.studies.benchmark import read_abouts, task_name
 from search.studies.cross_validation import ranking
 from search.studies.search import SETTINGS_KEY
+from search.training.provenance import read_about
 
 RESULTS = Path(__file__).parent
 ABOUT = "about.md"
@@ -130,6 +131,7 @@ def search_section(folder: Path, results: Path) -> Iterator[str]:
         report = runpy.run_path(str(results.parent / "benchmarks" / "fidelity.py"))["report"]
         yield f"`python benchmarks/fidelity.py {name}`:\n"
         yield from block(report(folder))
+        yield from core_hours(folder, ["candidates"])
         return
     trials = analysed(trial_table(study.get_trials(deepcopy=False)))
     evolved, random = trials[trials["operation"].isin(EVOLVED)], trials[trials["operation"] == "random"]
@@ -156,6 +158,23 @@ def search_section(folder: Path, results: Path) -> Iterator[str]:
         if not runs.empty:
             yield f"{part.capitalize()}, AULC:\n"
             yield from block(ranking(runs).round(1).to_string())
+    yield from core_hours(folder, ["candidates", "baselines", "cross-validation"])
+
+
+def core_hours(folder: Path, parts: Iterable[str]) -> Iterator[str]:
+    """
+    The runs of a search and the hours of one core that they took.
+
+    :param folder: Folder of the search
+    :param parts: Names of the folders in it that have runs
+    """
+    yield "| part | runs | core hours |"
+    yield "|---|---|---|"
+    for part in parts:
+        abouts = [read_about(path.parent) for path in (folder / part).rglob("curve.csv")]
+        hours = [about["seconds"] * about["sessions"][-1]["threads"] / 3600 for about in abouts if "seconds" in about]
+        yield f"| {part} | {len(hours)} | {math.fsum(hours):.1f} |"
+    yield f"\nThe paper stopped each of its searches from states after {PAPER_HOURS:,} GPU hours.\n"
 
 
 def summary(scores: list[float]) -> str:
