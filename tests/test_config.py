@@ -13,13 +13,7 @@ from hypothesis import strategies as st
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 from search.studies.config import Baseline, CrossValidation, SearchConfig, load_config
-from search.training.config import (
-    ConfigError,
-    check_hyperparameters,
-    load_hyperparameters,
-    read_yaml,
-    resolve_env_id,
-)
+from search.training.config import ConfigError, check_hyperparameters, load_hyperparameters, read_yaml, resolve_env_id
 from search.training.run import make_env
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"

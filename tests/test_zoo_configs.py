@@ -210,6 +210,10 @@ ENTROPY = {"ent_coef": "auto_0.1"}
 DENSE_MLP = {"precision": "bf16", "policy_kwargs": {"features_extractor_class": "dense_mlp"}}
 PAPERS, FINALIST = DENSE_MLP | ENTROPY, simba(64) | ENTROPY
 BLOCKS: dict[str, Any] = {"net_arch": [128], "network": "simba"}
+EVOLVED = (
+    "{s_t, a_t, r_t, a_t+1, r_t+1, a_t+2, r_t+2, a_t+3, r_t+4, s_t+5, a_t+5, a_t+6, a_t+7, a_t+8, r_t+8} "
+    "-> {s_t+1, s_t+2, s_t+3, s_t+4, a_t+4, s_t+6, s_t+8, s_t+9}"
+)
 # How files differ from SACAux's defaults: bodies that were compared, the finalist, its parts, and what it is compared with.
 BODIES: dict[str, dict[str, Any]] = {
     "body/default_dense_mlp_bf16": DENSE_MLP,
@@ -223,7 +227,8 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba/forward_simba_repeat_4": FINALIST | {"aux_loss": "forward-dynamics"},
     "forward_simba": simba(64)
     | {"aux_loss": "forward-dynamics", "learning_starts": 5000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4},
-    "simba/published_simba": FINALIST | {"aux_loss": "cheetah-run-state-3-1"},
+    "simba/published_simba": FINALIST | {"aux_loss": "cheetah-run-state-7-3"},
+    "simba/evolved_simba": FINALIST | {"aux_loss": EVOLVED},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/sac_states": {"aux_loss": None, "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}},
     "simba/aarl_dense_mlp": PAPERS,
