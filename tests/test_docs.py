@@ -20,11 +20,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = {path.relative_to(ROOT).as_posix(): path for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]}
 LANGUAGES = {"python", "bash", "yaml", "text"}
 # What takes long, and what is put in its place.
-SHORTER = {
-    r"learn\([\d_]+": "learn(150",
-    r"eval_freq=[\d_]+": "eval_freq=100",
-    r"pendulum\.yml": "small.yml",
-}
+SHORTER = {r"learn\([\d_]+": "learn(150", r"eval_freq=[\d_]+": "eval_freq=100", r"pendulum\.yml": "small.yml"}
 
 
 def blocks(page: str) -> list[tuple[str, str]]:

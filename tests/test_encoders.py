@@ -13,14 +13,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_aarl import SACAux
-from sb3_aarl.encoders import (
-    MLP,
-    DenseMLP,
-    MultiInputEncoder,
-    PixelEncoder,
-    RunningNorm,
-    SimbaEncoder,
-)
+from sb3_aarl.encoders import MLP, DenseMLP, MultiInputEncoder, PixelEncoder, RunningNorm, SimbaEncoder
 
 
 def images(channels: int, height: int, width: int) -> spaces.Box:

@@ -21,8 +21,9 @@ from typer.testing import CliRunner
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
+from sb3_aarl.catalog import resolve
 from search.cli.main import app
-from search.execution.matrix import cell_folder
+from search.execution.matrix import cell_folder, stored_scores
 from search.execution.storage import load_study, open_storage
 from search.results.analysis import analysed, trial_table
 from search.results.report import stored_baselines
@@ -30,6 +31,8 @@ from search.results.statistics import interquartile_means
 from search.results.table import paper_scores, read_runs
 from search.studies import benchmark
 from search.studies.benchmark import load_benchmark, read_abouts
+from search.studies.cross_validation import ranking
+from search.training.config import read_yaml
 from search.training.provenance import ABOUT
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -161,6 +164,12 @@ def test_a_search_found_what_its_text_says() -> None:
     assert f"AARL-State {baselines['AARL-State']:.0f}, no loss {baselines['No auxiliary loss']:.0f}." in readme
     first, second, *later = trials.groupby("generation")["score"].mean()
     assert first < second and max(later) < second + 5
+    # What is confirmed is what the cross-validation ranks first, and the best evolved loss, its second.
+    ranked = ranking(stored_scores(study_folder / "cross-validation"))["mean"]
+    files = [RESULTS.parent / f"zoo_configs/simba/{name}_simba.yml" for name in ("published", "evolved")]
+    assert [str(resolve(read_yaml(file)["default"]["aux_loss"])) for file in files] == list(ranked.index[:2])
+    text = "`{}`, is first with {:.0f}, the best evolved one second with {:.0f}"
+    assert text.format(ranked.index[0], *ranked[:2]) in readme
 
 
 def last_returns(variant: str, task: str = "cheetah-run", folder: str = "choices_small") -> list[float]:
