@@ -211,8 +211,8 @@ DENSE_MLP = {"precision": "bf16", "policy_kwargs": {"features_extractor_class": 
 PAPERS, FINALIST = DENSE_MLP | ENTROPY, simba(64) | ENTROPY
 BLOCKS: dict[str, Any] = {"net_arch": [128], "network": "simba"}
 EVOLVED = (
-    "{s_t, a_t, r_t, a_t+1, r_t+1, a_t+2, r_t+2, a_t+3, r_t+4, s_t+5, a_t+5, a_t+6, a_t+7, a_t+8, r_t+8} "
-    "-> {s_t+1, s_t+2, s_t+3, s_t+4, a_t+4, s_t+6, s_t+8, s_t+9}"
+    "{s_t, a_t, a_t+1, a_t+2, r_t+2, a_t+3, r_t+3, r_t+4, s_t+5, a_t+5, a_t+6, a_t+7, a_t+8, r_t+8} "
+    "-> {s_t+1, s_t+2, a_t+2, s_t+3, a_t+3, a_t+4, s_t+6, s_t+8, s_t+9}"
 )
 # How files differ from SACAux's defaults: bodies that were compared, the finalist, its parts, and what it is compared with.
 BODIES: dict[str, dict[str, Any]] = {
