@@ -172,9 +172,18 @@ def core_hours(folder: Path, parts: Iterable[str]) -> Iterator[str]:
     yield "|---|---|---|"
     for part in parts:
         abouts = [read_about(path.parent) for path in (folder / part).rglob("curve.csv")]
-        hours = [about["seconds"] * about["sessions"][-1]["threads"] / 3600 for about in abouts if "seconds" in about]
+        hours = [hours_of_a_core(about) for about in abouts if "seconds" in about]
         yield f"| {part} | {len(hours)} | {math.fsum(hours):.1f} |"
     yield f"\nThe paper stopped each of its searches from states after {PAPER_HOURS:,} GPU hours.\n"
+
+
+def hours_of_a_core(about: dict[str, Any]) -> float:
+    """
+    What a run took, in hours of one core.
+
+    :param about: The ``provenance.json`` of a finished run
+    """
+    return about["seconds"] * about["sessions"][-1]["threads"] / 3600
 
 
 def summary(scores: list[float]) -> str:
@@ -286,7 +295,7 @@ def cost(abouts: list[dict[str, Any]]) -> Iterator[str]:
         runs = [about for about in abouts if about["variant"] == variant]
         seconds = [about["seconds"] for about in runs]
         shown = f"{statistics.median(seconds):,.0f} ({min(seconds):,.0f} to {max(seconds):,.0f})"
-        hours = [about["seconds"] * about["sessions"][-1]["threads"] / 3600 for about in runs]
+        hours = [hours_of_a_core(about) for about in runs]
         per_step = statistics.median(h / about["evaluations"][-1] for h, about in zip(hours, runs, strict=True))
         # A candidate has a loss.
         whole = "" if runs[0]["hyperparameters"]["aux_loss"] is None else f"{CANDIDATES * STEPS * per_step:,.0f}"
