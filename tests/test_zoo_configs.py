@@ -232,6 +232,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/sac_states": {"aux_loss": None, "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}},
     "simba/aarl_dense_mlp": PAPERS,
+    "simba/published_dense_mlp": PAPERS | {"aux_loss": "cheetah-run-state-7-3"},
     "simba/forward_dense_mlp": PAPERS | {"aux_loss": "forward-dynamics"},
     "simba/dense_mlp_alone": PAPERS | {"aux_loss": None},
     "simba/aarl_simba_heads": with_policy(FINALIST, **BLOCKS),
