@@ -27,11 +27,7 @@ PATTERNS = {
     "Action inference": ({"s_t", "s_t+1"}, {"a_t"}),
     "State reconstruction": ({"s_t"}, {"s_t"}),
 }
-COUNTS = {
-    "State, n_target > n_source": "s",
-    "Action, n_target > n_source": "a",
-    "Reward, n_target > n_source": "r",
-}
+COUNTS = {"State, n_target > n_source": "s", "Action, n_target > n_source": "a", "Reward, n_target > n_source": "r"}
 
 
 def tokens(loss):

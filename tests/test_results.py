@@ -170,6 +170,11 @@ def test_a_search_found_what_its_text_says() -> None:
     assert [str(resolve(read_yaml(file)["default"]["aux_loss"])) for file in files] == list(ranked.index[:2])
     text = "`{}`, is first with {:.0f}, the best evolved one second with {:.0f}"
     assert text.format(ranked.index[0], *ranked[:2]) in readme
+    names = ("published", "evolved", "aarl", "forward")
+    confirmed = [last_returns(f"{name}_simba", folder="confirmation") for name in names]
+    text = "the first has {}, the second {}, AARL-State {} and forward dynamics {}: the search has found nothing yet"
+    assert text.format(*map(with_seeds, confirmed)) in readme
+    assert min(mannwhitneyu(confirmed[2], found).pvalue for found in confirmed[:2]) > 0.05
 
 
 def last_returns(variant: str, task: str = "cheetah-run", folder: str = "choices_small") -> list[float]:
