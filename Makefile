@@ -41,9 +41,9 @@ define install
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	if $(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then \
-		$(BIN)/python -m pip install --quiet --no-compile --no-deps -c constraints.txt dm-control; \
+		$(BIN)/python -m pip install --quiet --no-deps -c constraints.txt dm-control; \
 	fi
-	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[$(1)]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[$(1)]'
 	touch $@
 endef
 
