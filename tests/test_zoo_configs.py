@@ -228,6 +228,8 @@ BODIES: dict[str, dict[str, Any]] = {
     "forward_simba": simba(64)
     | {"aux_loss": "forward-dynamics", "learning_starts": 5000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4},
     "simba/published_simba": FINALIST | {"aux_loss": "cheetah-run-state-7-3"},
+    "simba/aarl_simba_fp32": FINALIST | {"precision": "fp32"},
+    "simba/published_simba_fp32": FINALIST | {"aux_loss": "cheetah-run-state-7-3", "precision": "fp32"},
     "simba/evolved_simba": FINALIST | {"aux_loss": EVOLVED},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/sac_states": {"aux_loss": None, "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}},
