@@ -103,12 +103,8 @@ def test_masks_that_are_typed_out() -> None:
     loss = AuxLoss(2, source, target, "cosine", True)
     assert str(loss) == "{s_t, a_t} -> {r_t+1, s_t+2} [cosine, negatives]"
     assert loss.latex() == r"\{s_t, a_t\} \rightarrow \{r_{t+1}, s_{t+2}\}"
-    assert loss.to_dict() == {
-        "loss": "{s_t, a_t} -> {r_t+1, s_t+2}",
-        "horizon": 2,
-        "operator": "cosine",
-        "negatives": True,
-    }
+    values = {"horizon": 2, "operator": "cosine", "negatives": True}
+    assert loss.to_dict() == {"loss": "{s_t, a_t} -> {r_t+1, s_t+2}", **values}
     assert AuxLoss.parse("{s_t, a_t} -> {r_t+1, s_t+2}") == AuxLoss(2, source, target)
     assert str(AuxLoss(2, (True,) + (False,) * 6, (True,) + (False,) * 6)) == "{s_t} -> {s_t} [horizon=2]"
 
