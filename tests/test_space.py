@@ -237,11 +237,7 @@ def test_the_space_is_that_of_the_sampler(settings: dict[str, Any]) -> None:
 def test_the_loss_of_a_trial() -> None:
     loss = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
     params: dict[str, Any] = loss_to_params(loss)
-    for trial_params, expected in (
-        (params, loss),
-        ({}, None),
-        ({"horizon": 1}, None),
-        (params | {"source/s_t": False}, None),
-    ):
+    no_source = params | {"source/s_t": False}
+    for trial_params, expected in ((params, loss), ({}, None), ({"horizon": 1}, None), (no_source, None)):
         space = {name: distributions(1)[name] for name in trial_params}
         assert loss_of(optuna.create_trial(params=trial_params, distributions=space, value=0.0)) == expected
