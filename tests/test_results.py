@@ -175,8 +175,9 @@ def test_a_search_found_what_its_text_says() -> None:
     text = "the first has {}, the second {}, AARL-State {} and forward dynamics {}: the search has found nothing yet"
     assert text.format(*map(with_seeds, confirmed)) in readme
     assert min(mannwhitneyu(confirmed[2], found).pvalue for found in confirmed[:2]) > 0.05
-    others = {"walker-walk": ("published_simba_fp32", "aarl_simba"), "reacher-hard": ("published_simba_fp32", "aarl_simba_fp32")}
-    elsewhere = [last_returns(name, task, "confirmation_fp32") for task, names in others.items() for name in names]
+    compared = {"walker-walk": "aarl_simba", "reacher-hard": "aarl_simba_fp32"}
+    variants = [(name, task) for task, other in compared.items() for name in ("published_simba_fp32", other)]
+    elsewhere = [last_returns(*variant, "confirmation_fp32") for variant in variants]
     text = "On Walker-Walk the first has {}, AARL-State {}, on Reacher-Hard {} and {}: they are level"
     assert text.format(*map(with_seeds, elsewhere)) in readme
     assert are_close(*elsewhere[:2]) and are_close(*elsewhere[2:])
