@@ -174,7 +174,8 @@ def test_a_search_found_what_its_text_says() -> None:
     confirmed = [last_returns(f"{name}_simba", folder="confirmation") for name in names]
     text = "the first has {}, the second {}, AARL-State {} and forward dynamics {}: the search has found nothing yet"
     assert text.format(*map(with_seeds, confirmed)) in readme
-    assert min(mannwhitneyu(confirmed[2], found).pvalue for found in confirmed[:2]) > 0.05
+    published, best_evolved, _, forward = (mannwhitneyu(confirmed[2], found).pvalue for found in confirmed)
+    assert min(published, best_evolved) > 0.05 > forward
     compared = {"walker-walk": "aarl_simba", "reacher-hard": "aarl_simba_fp32"}
     variants = [(name, task) for task, other in compared.items() for name in ("published_simba_fp32", other)]
     elsewhere = [last_returns(*variant, "confirmation_fp32") for variant in variants]

@@ -186,11 +186,7 @@ def test_discrete_actions_are_refused(space: spaces.Space) -> None:
 
 @pytest.mark.parametrize(
     ("shape", "encoded"),
-    [
-        ((1, 36, 36), (1, 36, 36)),
-        ((3, 40, 60), (3, 40, 60)),
-        ((2, 90, 110), (2, 84, 84)),
-    ],
+    [((1, 36, 36), (1, 36, 36)), ((3, 40, 60), (3, 40, 60)), ((2, 90, 110), (2, 84, 84))],
     ids=str,
 )
 def test_images_of_any_size(shape: tuple[int, int, int], encoded: tuple[int, int, int]) -> None:
