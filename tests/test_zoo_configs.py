@@ -209,7 +209,7 @@ def with_policy(values: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
 ENTROPY = {"ent_coef": "auto_0.1"}
 DENSE_MLP = {"precision": "bf16", "policy_kwargs": {"features_extractor_class": "dense_mlp"}}
 PAPERS, FINALIST = DENSE_MLP | ENTROPY, simba(64) | ENTROPY
-FP32 = {"policy_kwargs": FINALIST["policy_kwargs"]} | ENTROPY
+PAPERS_FP32, FINALIST_FP32 = ({"policy_kwargs": body["policy_kwargs"]} | ENTROPY for body in (PAPERS, FINALIST))
 BLOCKS: dict[str, Any] = {"net_arch": [128], "network": "simba"}
 EVOLVED = (
     "{s_t, a_t, a_t+1, a_t+2, r_t+2, a_t+3, r_t+3, r_t+4, s_t+5, a_t+5, a_t+6, a_t+7, a_t+8, r_t+8} "
@@ -229,13 +229,14 @@ BODIES: dict[str, dict[str, Any]] = {
     "forward_simba": simba(64)
     | {"aux_loss": "forward-dynamics", "learning_starts": 5000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4},
     "simba/published_simba": FINALIST | {"aux_loss": "cheetah-run-state-7-3"},
-    "simba/aarl_simba_fp32": FP32,
-    "simba/published_simba_fp32": FP32 | {"aux_loss": "cheetah-run-state-7-3"},
+    "simba/aarl_simba_fp32": FINALIST_FP32,
+    "simba/published_simba_fp32": FINALIST_FP32 | {"aux_loss": "cheetah-run-state-7-3"},
     "simba/evolved_simba": FINALIST | {"aux_loss": EVOLVED},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/sac_states": {"aux_loss": None, "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}},
     "simba/aarl_dense_mlp": PAPERS,
-    "simba/published_dense_mlp": PAPERS | {"aux_loss": "cheetah-run-state-7-3"},
+    "simba/aarl_dense_mlp_fp32": PAPERS_FP32,
+    "simba/published_dense_mlp_fp32": PAPERS_FP32 | {"aux_loss": "cheetah-run-state-7-3"},
     "simba/forward_dense_mlp": PAPERS | {"aux_loss": "forward-dynamics"},
     "simba/dense_mlp_alone": PAPERS | {"aux_loss": None},
     "simba/aarl_simba_heads": with_policy(FINALIST, **BLOCKS),
