@@ -37,12 +37,8 @@ class Postgres:
         self._bin = found[-1] if found else Path(str(which)).parent
         self.port = free_port()
         self._folder = Path(tempfile.mkdtemp(prefix="aarl-postgres-"))
-        self._settings = {
-            "listen_addresses": "127.0.0.1",
-            "port": str(self.port),
-            "unix_socket_directories": "",
-            **settings,
-        }
+        addresses = {"listen_addresses": "127.0.0.1", "unix_socket_directories": ""}
+        self._settings = {"port": str(self.port), **addresses, **settings}
         password_file = self._folder / "password"
         password_file.write_text(PASSWORD)
         if os.getuid() == 0:  # it refuses to run as root

@@ -181,7 +181,10 @@ def test_a_search_found_what_its_text_says() -> None:
     elsewhere = [last_returns(*variant, "confirmation_fp32") for variant in variants]
     text = "On Walker-Walk the first has {}, AARL-State {}, on Reacher-Hard {} and {}: they are level"
     assert text.format(*map(with_seeds, elsewhere)) in readme
-    assert are_close(*elsewhere[:2]) and are_close(*elsewhere[2:])
+    with_papers = [last_returns(f"{name}_dense_mlp_fp32", folder="confirmation_dense_mlp") for name in ("published", "aarl")]
+    text = "With the paper's encoder the first has {} on Cheetah-Run, AARL-State {} ("
+    assert text.format(*map(with_seeds, with_papers)) in readme
+    assert all(are_close(*pair) for pair in (elsewhere[:2], elsewhere[2:], with_papers))
 
 
 def last_returns(variant: str, task: str = "cheetah-run", folder: str = "choices_small") -> list[float]:
