@@ -41,11 +41,8 @@ class Point(gym.Env):
         self.length = length
         vector = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         image = spaces.Box(0, 255, (3, 18, 20), np.uint8)
-        self.observation_space = {
-            "state": vector,
-            "pixels": image,
-            "dict": spaces.Dict({"vector": vector, "image": image}),
-        }[kind]
+        both = spaces.Dict({"vector": vector, "image": image})
+        self.observation_space = {"state": vector, "pixels": image, "dict": both}[kind]
         self.action_space = spaces.Box(-2, 2, (2,), np.float32)
 
     def observe(self) -> Any:

@@ -81,9 +81,6 @@ def all_slots(first: int, later: int, n_generations: int) -> list[tuple[int, int
     return [(number, slot) for number in range(1, n_generations + 1) for slot in range(first if number == 1 else later)]
 
 
-# Generations, shares, parents.
-
-
 def test_the_paper_s_shares_and_sizes() -> None:
     sampler = AuxLossSampler()
     assert Counter(sampler.operations(1)) == {"random": 100, "prior": 25}
@@ -468,9 +465,6 @@ def test_a_copy_of_a_trial_whose_heartbeat_stopped_keeps_its_slot() -> None:
     assert losses_of(run(study)).keys() >= losses_of(run(make_study())).keys()
 
 
-# Enqueued trials.
-
-
 def test_an_enqueued_loss_is_trained_in_a_random_slot() -> None:
     study = make_study(n_generations=2, n_random=2, n_prior=2)
     for _ in range(4):
@@ -542,7 +536,21 @@ def test_other_parameters_are_drawn_by_slot() -> None:
     assert len(set(alone.values())) == 12
 
 
-# Around it.
+def test_trials_may_be_pruned_before_the_loss_and_its_parameters_fixed() -> None:
+    study = make_study(n_generations=2)
+    sampler, fixed = sampler_of(study), {"horizon": 2, "target/r_t": True}
+    with pytest.warns(optuna.exceptions.ExperimentalWarning):
+        study.sampler = optuna.samplers.PartialFixedSampler(fixed, sampler)
+
+    def objective(trial: optuna.Trial) -> float:
+        if trial.suggest_float("rate", 0, 1) < 0.5:
+            raise optuna.TrialPruned
+        return score(suggest_aux_loss(trial, 2))
+
+    study.optimize(objective, n_trials=200, callbacks=[sampler.stop_when_complete])
+    complete = study.get_trials(states=(TrialState.COMPLETE,))
+    assert len(complete) == 24 < len(study.trials) < 200
+    assert all(fixed.items() <= trial.params.items() for trial in complete)
 
 
 @pytest.mark.parametrize("pruner", [optuna.pruners.MedianPruner(3), optuna.pruners.HyperbandPruner(1, 9)])
@@ -599,12 +607,6 @@ def test_a_study_does_not_resume_with_other_settings(name: str, value: Any) -> N
 def test_settings_that_do_not_fit_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         AuxLossSampler(**settings)
-
-
-def test_several_objectives_are_refused() -> None:
-    study = optuna.create_study(directions=["maximize", "minimize"], sampler=AuxLossSampler(seed=0))
-    with pytest.raises(RuntimeError, match="multi-objective"):
-        study.ask()
 
 
 def test_a_study_whose_objective_has_no_loss_is_refused() -> None:

@@ -52,8 +52,9 @@ class AuxLossSampler(BaseSampler):
 
     A trial gets its slot when it is asked for, and shows it in its user attributes ``generation``, ``slot``, ``attempt``,
     ``operation`` and ``parents``. Its loss depends on the seed, the slot and earlier generations, not on the number of trials
-    that run at once. A failed trial frees its slot for another candidate, or for the same one if it has the user attribute
-    ``interrupted``. An enqueued trial takes a random slot if there is one; what was not enqueued is drawn at random.
+    that run at once. A failed trial, or one that is pruned before it has a loss, frees its slot for another candidate; for the
+    same one if it has the user attribute ``interrupted``. An enqueued trial takes a random slot if there is one; what was not
+    enqueued is drawn at random.
 
     Asking never waits. A trial that finds no free slot gets one more offspring of the last parents and a slot number behind
     all others; it counts if it finishes before its generation is over. Trials of a killed program stay RUNNING and hold their
@@ -174,7 +175,8 @@ class AuxLossSampler(BaseSampler):
 
     def sample_relative(self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]) -> dict[str, Any]:
         loss = trial.system_attrs[SLOT_KEY]["loss"]
-        return {} if loss is None else space.loss_to_params(AuxLoss.parse(loss), self.operators)
+        params = {} if loss is None else space.loss_to_params(AuxLoss.parse(loss), self.operators)
+        return {name: value for name, value in params.items() if name in search_space}
 
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
@@ -249,8 +251,9 @@ class _Slots:
 
     def _finish(self, trial: FrozenTrial, generation: int, slot: int) -> None:
         self.interrupted.pop((generation, slot), None)
-        loss = space.loss_of(trial)
-        if trial.state == TrialState.FAIL:
+        loss, drawn = space.loss_of(trial), trial.system_attrs[SLOT_KEY]["loss"]
+        # Pruned before it was asked for its loss: another candidate, with which other parameters are drawn again.
+        if trial.state == TrialState.FAIL or (trial.state == TrialState.PRUNED and loss is None and drawn is not None):
             if trial.user_attrs.get("interrupted"):
                 self.interrupted[generation, slot] = trial
             else:
