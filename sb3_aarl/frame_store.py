@@ -63,7 +63,7 @@ class FrameStore:
                     "outermost observation wrapper, along the channels, oldest frame first: action repeat, rendering and "
                     "resizing inside, FrameStackObservation or VecFrameStack outside. If observations are no stacks, pass "
                     "replay_buffer_kwargs=dict(frame_stack=1). If the environments were stepped outside of learn(), or the "
-                    "buffer was emptied inside an episode, reset the environments"
+                    "buffer was emptied inside an episode, model.set_env(model.get_env()) has learn() reset them"
                 )
 
     def put(self, number: int, observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray) -> None:

@@ -72,7 +72,7 @@ class SACAux(SAC):
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns, not for Dict observations (as in SB3)
     :param ent_coef: As in SB3; ``"auto_0.1"`` (default, the paper) learns it from 0.1 on
-    :param target_update_interval: Gradient steps between updates of the target critic
+    :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
     :param target_entropy: As in SB3
     :param use_sde: Whether to use gSDE, as in SB3
     :param sde_sample_freq: As in SB3
