@@ -8,12 +8,13 @@ from search.results.plots import learning_curves_plot
 from search.studies.benchmark import read_curves
 
 RESULTS = Path(__file__).parent
-FOLDERS = ("simba_cheetah_run", "simba", "choices_small")
-# What the picture calls each variant. On Walker-Walk action repeat is 2 for the first and 4 for the others.
+FOLDERS = ("confirmation", "simba", "choices_small")
+# What the picture calls each variant.
 VARIANTS = {
     "forward_simba": "SACAux: forward dynamics, encoder simba",
     "aarl_state_small": "SACAux: the paper's AARL-State and encoder",
-    "sac_identity_small": "SAC",
+    "aarl_state_small_repeat_2": "SACAux: the paper's AARL-State and encoder",
+    "sac_states": "SAC",
     "sac_starts_5000": "SAC",
 }
 # Means of 10 seeds at 100,000 environment steps: result files of github.com/dmksjfl/DR.Q, and for MR.Q its own, read on
@@ -28,7 +29,8 @@ PUBLISHED = {
 
 def main() -> None:
     curves = pd.concat(read_curves(RESULTS / folder) for folder in FOLDERS)
-    curves = curves[curves["variant"].isin(VARIANTS) & curves["env"].isin(PUBLISHED)]
+    curves = curves[curves["variant"].isin(VARIANTS) & curves["env"].isin(PUBLISHED)].drop_duplicates()  # linked runs
+    curves = curves[(curves["env"] != "walker-walk") | (curves["variant"] != "aarl_state_small")]  # action repeat 4 there
     curves["variant"] = pd.Categorical(curves["variant"].map(VARIANTS), list(dict.fromkeys(VARIANTS.values())))
     figure = learning_curves_plot(curves.sort_values(["env", "variant"]))
     for axes in figure.axes:

@@ -157,9 +157,10 @@ def test_a_search_found_what_its_text_says() -> None:
     assert mannwhitneyu(evolved, random, alternative="greater").pvalue < 1e-6
     assert evolved.mean() < given.mean() and evolved.max() < given.max()
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
-    shown = [make_readme["summary"](scores.tolist()).partition(" (")[0] for scores in (evolved, random)]
-    assert f"{len(trials)} candidates" in readme and f"The best, {given.max():.0f}," in readme
-    assert "evolved losses score {}, random ones {},".format(*shown) in readme
+    shown = [make_readme["summary"](scores.tolist()).partition(" (")[0] for scores in (evolved, random, given)]
+    assert f"{len(trials)} candidates" in readme and f"The best, {given.max():.0f}, is one of the given." in readme
+    text = "Means with their standard errors: evolved losses score {}, random ones {}, the given ones, {}, {};"
+    assert text.format(*shown[:2], "which people or the paper's search chose", shown[2]) in readme
     baselines = dict(stored_baselines(study_folder))
     assert f"AARL-State {baselines['AARL-State']:.0f}, no loss {baselines['No auxiliary loss']:.0f}." in readme
     first, second, *later = trials.groupby("generation")["score"].mean()
@@ -168,7 +169,7 @@ def test_a_search_found_what_its_text_says() -> None:
     ranked = ranking(stored_scores(study_folder / "cross-validation"))["mean"]
     files = [RESULTS.parent / f"zoo_configs/simba/{name}_simba.yml" for name in ("published", "evolved")]
     assert [str(resolve(read_yaml(file)["default"]["aux_loss"])) for file in files] == list(ranked.index[:2])
-    text = "`{}`, is first with {:.0f}, the best evolved one second with {:.0f}"
+    text = "`{}`, is first with {:.0f}, the best evolved one second with {:.0f}, means of both tasks"
     assert text.format(ranked.index[0], *ranked[:2]) in readme
     names = ("published", "evolved", "aarl", "forward")
     confirmed = [last_returns(f"{name}_simba", folder="confirmation") for name in names]
@@ -290,11 +291,13 @@ def test_defaults_are_what_was_decided() -> None:
 def test_figures_of_the_first_readme() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
 
-    def by_task(variant: str) -> dict[str, list[float]]:
-        return {path.name: last_returns(variant, path.name, "simba") for path in (RESULTS / "simba" / variant).iterdir()}
+    def by_task(variant: str, folder: str = "simba") -> dict[str, list[float]]:
+        return {path.name: last_returns(variant, path.name, folder) for path in (RESULTS / folder / variant).iterdir()}
 
-    sac = {"cheetah-run": last_returns("sac_identity_small"), **by_task("sac_starts_5000")}
+    sac = by_task("sac_states", "confirmation") | by_task("sac_starts_5000")
     forward = {"cheetah-run": last_returns("forward_simba", folder="simba_cheetah_run"), **by_task("forward_simba")}
+    means = [statistics.mean(returns["cheetah-run"]) for returns in (forward, sac)]
+    assert "its return is {:.0f} where SAC's is {:.0f}.".format(*means) in readme
     for task, returns in forward.items():
         name = task if task.endswith("-v5") else task.title()
         assert f"| {name} | {with_seeds(sac.get(task, []))} | {with_seeds(returns)} |" in readme
