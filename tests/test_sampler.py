@@ -235,9 +235,6 @@ def test_without_two_parents_of_one_horizon_a_crossover_becomes_a_replacement() 
     assert operations == ["replacement"] * 4
 
 
-# Timing.
-
-
 def simulate(seed: int, n_running: int, **settings: Any) -> optuna.Study:
     """
     A search with trials that finish in any order. Some losses always fail, others are pruned; trials are interrupted, and the
@@ -363,9 +360,6 @@ def test_threads_fill_every_slot_and_end() -> None:
     assert len(losses_of(study)) == len(study.trials)  # no slot twice
     alone = losses_of(run(make_study()))
     assert all(loss == alone[key] for key, loss in losses_of(study).items() if key[0] == 1 and key[1] < 12)
-
-
-# Slots.
 
 
 def test_random_slots_of_the_next_generation_come_while_this_one_ends() -> None:
@@ -607,6 +601,12 @@ def test_a_study_does_not_resume_with_other_settings(name: str, value: Any) -> N
 def test_settings_that_do_not_fit_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         AuxLossSampler(**settings)
+
+
+def test_several_objectives_are_refused() -> None:
+    study = optuna.create_study(directions=["maximize", "minimize"], sampler=AuxLossSampler(seed=0))
+    with pytest.raises(RuntimeError, match="multi-objective"):
+        study.ask()
 
 
 def test_a_study_whose_objective_has_no_loss_is_refused() -> None:
