@@ -150,8 +150,7 @@ def test_mean_of_the_best_of_some_scores() -> None:
 def test_a_search_found_what_its_text_says() -> None:
     """results/search/cheetah_run_simba/about.md is right about its study."""
     study_folder = RESULTS / "search" / "cheetah_run_simba"
-    study = load_study(open_storage(study_folder, create=False))
-    trials = analysed(trial_table(study.get_trials(deepcopy=False)))
+    trials = analysed(trial_table(load_study(open_storage(study_folder, create=False)).get_trials(deepcopy=False)))
     evolved = trials[trials["operation"].isin(make_readme["EVOLVED"])]["score"]
     random, given = (trials[trials["operation"] == operation]["score"] for operation in ("random", "given"))
     assert mannwhitneyu(evolved, random, alternative="greater").pvalue < 1e-6
@@ -178,14 +177,16 @@ def test_a_search_found_what_its_text_says() -> None:
     published, best_evolved, _, forward = (mannwhitneyu(confirmed[2], found).pvalue for found in confirmed)
     assert min(published, best_evolved) > 0.05 > forward
     compared = {"walker-walk": "aarl_simba", "reacher-hard": "aarl_simba_fp32"}
-    variants = [(name, task) for task, other in compared.items() for name in ("published_simba_fp32", other)]
+    variants = [(name, task) for task, other in compared.items() for name in ("published_simba_fp32", other, "sac_simba_fp32")]
     elsewhere = [last_returns(*variant, "confirmation_fp32") for variant in variants]
-    text = "On Walker-Walk the first has {}, AARL-State {}, on Reacher-Hard {} and {}: they are level"
+    text = "On Walker-Walk the first has {}, AARL-State {} and no loss {}, on Reacher-Hard {}, {} and {}: they are level"
     assert text.format(*map(with_seeds, elsewhere)) in readme
     with_papers = [last_returns(f"{name}_dense_mlp_fp32", folder="confirmation_dense_mlp") for name in ("published", "aarl")]
-    text = "With the paper's encoder the first has {} on Cheetah-Run, AARL-State {} ("
-    assert text.format(*map(with_seeds, with_papers)) in readme
-    assert all(are_close(*pair) for pair in (elsewhere[:2], elsewhere[2:], with_papers))
+    whole_size = [last_returns(name, folder="choices") for name in ("published_state", "aarl_state_bf16")]
+    text = "With the paper's encoder the first has {} on Cheetah-Run, AARL-State {}; at the paper's size {} and {} ("
+    assert text.format(*map(with_seeds, with_papers + whole_size)) in readme
+    for group in (elsewhere[:3], elsewhere[3:], with_papers):
+        assert all(are_close(*pair) for pair in itertools.combinations(group, 2))
 
 
 def last_returns(variant: str, task: str = "cheetah-run", folder: str = "choices_small") -> list[float]:
