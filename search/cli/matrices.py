@@ -48,25 +48,16 @@ def compare(
     matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str, json: bool
 ) -> "pd.DataFrame | None":
     """Show a table of the variants that can be compared, and return it."""
-    from search.execution.matrix import comparable, scores
+    from search.execution.matrix import comparable, scores, task_name
 
     compared = comparable(scores(matrix))
     ranked = None if compared.empty else table(compared)
     if json:
         say_json([] if ranked is None else records(ranked))
     elif ranked is not None:
-        show_table(texts(ranked), title)
+        shown = ranked.map("{:.3f}".format).replace("nan", "-").assign(runs=ranked["runs"].map(str))
+        show_table(shown.rename(columns=task_name).reset_index(), title)
     return ranked
-
-
-def texts(frame: "pd.DataFrame") -> "pd.DataFrame":
-    """A table of numbers as it is shown, with the short names of DeepMind Control's tasks."""
-    from search.execution.matrix import task_name
-
-    shown = frame.map("{:.3f}".format).replace("nan", "-")
-    if "runs" in frame:
-        shown["runs"] = frame["runs"].map(str)
-    return shown.rename(columns=task_name).reset_index()
 
 
 def exit_if_failed(matrix: "Matrix") -> None:

@@ -1,7 +1,6 @@
 """The command ``aarl search``: it wires configuration, storage, sampler, executor, driver and notes."""
 
 import time
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,7 +11,7 @@ from search.cli.console import live, say, show_costs, time_to_go
 from search.cli.options import DryRun, Folder, SearchFile, Storage, Threads, read_config, run_folder
 
 if TYPE_CHECKING:
-    from optuna import Study, Trial
+    from optuna import Trial
 
     from search.execution.driver import SearchProgress
     from search.studies.config import SearchConfig
@@ -55,11 +54,12 @@ def search(
         raise ValueError(f"--{named[0]} needs --executor ray")
 
     from optuna import get_all_study_names, logging
+    from optuna_dashboard import save_note
 
     from search.execution.driver import Driver
     from search.execution.runs import LocalExecutor
     from search.execution.storage import STUDY_FILE, open_storage
-    from search.results.dashboard import update_plots
+    from search.results.dashboard import HOW_TO_READ, annotate_trial, update_plots
     from search.results.report import stored_baselines
     from search.studies.search import open_search, runs_of
     from search.training.provenance import hide_password
@@ -87,7 +87,16 @@ def search(
         running = RayExecutor(ray_address, 1 if cpus_per_run is None else cpus_per_run, gpus_per_run or 0)
     else:
         running = LocalExecutor(at_once)
-    annotate = annotations(study, path)
+    save_note(study, HOW_TO_READ)
+    drawn = -PLOT_SECONDS
+
+    def annotate(trial: "Trial") -> None:
+        nonlocal drawn
+        annotate_trial(trial)
+        if time.monotonic() - drawn > PLOT_SECONDS:
+            drawn = time.monotonic()
+            update_plots(study, stored_baselines(path))
+
     progresses: Any = iter(
         Driver(study, opened, runs_of(settings), running, path, at_once, settings.retries, on_change=annotate)
     )
@@ -116,26 +125,6 @@ def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
         baseline = f", {cell.variant}" if cell.variant in names else ""
         kinds.setdefault(f"cross-validate: {task_name(cell.environment)}{baseline}", []).append(run)
     return kinds
-
-
-def annotations(study: "Study", folder: Path) -> "Callable[[Trial], None]":
-    """Write the note of a study; the function that is returned keeps the notes of its trials and its plot up to date."""
-    from optuna_dashboard import save_note
-
-    from search.results.dashboard import HOW_TO_READ, annotate_trial, update_plots
-    from search.results.report import stored_baselines
-
-    save_note(study, HOW_TO_READ)
-    drawn = -PLOT_SECONDS
-
-    def annotate(trial: "Trial") -> None:
-        nonlocal drawn
-        annotate_trial(trial)
-        if time.monotonic() - drawn > PLOT_SECONDS:
-            drawn = time.monotonic()
-            update_plots(study, stored_baselines(folder))
-
-    return annotate
 
 
 def progress_line(progress: "SearchProgress") -> str:

@@ -305,7 +305,6 @@ def summary(
     trials: Sequence[FrozenTrial],
     direction: StudyDirection = StudyDirection.MAXIMIZE,
     patterns: Mapping[str, str | AuxLoss] = PATTERNS,
-    top: int = 10,
 ) -> Summary:
     """Everything above for one study; ``operator`` only if it was searched, the losses of ``lineage`` as their notation."""
     table = trial_table(trials)
@@ -327,7 +326,7 @@ def summary(
     except ValueError as error:
         problems["importances"] = str(error)
     try:
-        tables["rank_agreement"] = rank_agreement(rankings(analysed(table)), top).rename_axis(["metric", "other metric"])
+        tables["rank_agreement"] = rank_agreement(rankings(analysed(table))).rename_axis(["metric", "other metric"])
     except ValueError as error:
         problems["rank_agreement"] = str(error)
     return Summary(tables, problems)

@@ -57,8 +57,5 @@ def measure(run: Run) -> dict[str, float]:
 
 def costs(kinds: Mapping[str, Sequence[Run]]) -> pd.DataFrame:
     """One row for each kind of runs: ``runs``, what :func:`measure` returns of the first one, and ``core hours`` of all."""
-    rows = []
-    for runs in kinds.values():
-        cost = measure(runs[0])
-        rows.append({"runs": len(runs), **cost, "core hours": len(runs) * cost["hours of a run"] * runs[0].threads})
-    return pd.DataFrame(rows)
+    found = pd.DataFrame([{"runs": len(runs), "threads": runs[0].threads, **measure(runs[0])} for runs in kinds.values()])
+    return found.assign(**{"core hours": found["runs"] * found["threads"] * found["hours of a run"]})
