@@ -56,6 +56,9 @@ def measure(run: Run) -> dict[str, float]:
 
 
 def costs(kinds: Mapping[str, Sequence[Run]]) -> pd.DataFrame:
-    """One row for each kind of runs: ``runs``, what :func:`measure` returns of the first one, and ``core hours`` of all."""
+    """
+    One row for each kind of runs: ``runs``, ``threads`` of one, what :func:`measure` returns of the first one, and
+    ``core hours`` of all.
+    """
     found = pd.DataFrame([{"runs": len(runs), "threads": runs[0].threads, **measure(runs[0])} for runs in kinds.values()])
     return found.assign(**{"core hours": found["runs"] * found["threads"] * found["hours of a run"]})
