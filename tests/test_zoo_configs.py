@@ -233,6 +233,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "simba/aarl_simba_fp32": FINALIST_FP32,
     "simba/published_simba_fp32": FINALIST_FP32 | {"aux_loss": "cheetah-run-state-7-3"},
     "simba/evolved_simba": FINALIST | {"aux_loss": EVOLVED},
+    "simba/evolved_simba_fp32": FINALIST_FP32 | {"aux_loss": EVOLVED},
     "simba/sac_simba": FINALIST | {"aux_loss": None},
     "simba/sac_simba_fp32": FINALIST_FP32 | {"aux_loss": None},
     "simba/sac_states": {"aux_loss": None, "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}},
