@@ -177,9 +177,9 @@ def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path) -> None:
     runs, steps, gradient_steps, step_ms, gradient_ms, hours, core_hours, _ = map(float, row.replace("│", "").split()[1:])
     # 2 random ones and a prior, then 3; two seeds. Training begins after 40 steps.
     assert (runs, steps, gradient_steps) == (12, 400, 360)
-    # And two evaluations of an episode of 200 steps.
-    assert hours == pytest.approx((800 * step_ms + 360 * gradient_ms) / 3.6e6, rel=0.05)
-    assert core_hours == pytest.approx(12 * hours, rel=0.05)
+    # And two evaluations of an episode of 200 steps. Two digits are shown: each side is rounded by up to 5 %.
+    assert hours == pytest.approx((800 * step_ms + 360 * gradient_ms) / 3.6e6, rel=0.11)
+    assert core_hours == pytest.approx(12 * hours, rel=0.11)
     assert "All: 12 runs" in output and "with --workers 4" in output
     assert not Path("runs").exists()
 
