@@ -189,7 +189,8 @@ def test_a_search_found_what_its_text_says() -> None:
     published, best_evolved, _, forward, none = (mannwhitneyu(confirmed[2], found).pvalue for found in confirmed)
     assert min(published, best_evolved) > 0.05 > max(forward, none)
     assert all(are_close(*pair) for pair in zip(confirmed, again, strict=True) if pair[1])
-    assert mannwhitneyu(again[1], again[2]).pvalue > 0.05 > max(mannwhitneyu(again[4], row).pvalue for row in again[1:3])
+    assert min(mannwhitneyu(again[2], row).pvalue for row in again[:2]) > 0.05
+    assert max(mannwhitneyu(again[4], row).pvalue for row in again[:3]) < 0.05
     for row in others:
         assert all(are_close(*pair) for pair in itertools.combinations(filter(None, (*row[:3], row[4])), 2))
     assert statistics.mean(rows["Walker-Walk"][3]) > statistics.mean(rows["Walker-Walk"][0])
