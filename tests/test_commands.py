@@ -20,6 +20,7 @@ from sb3_aarl import SACAux
 from sb3_aarl.callbacks import read_curve
 from search.cli.main import app
 from search.studies.config import load_config
+from search.studies.cost import measure
 from search.training.run import prepare_run, train
 from search.training.shipped import ZOO, find_file, shipped_files
 
@@ -170,16 +171,20 @@ def test_init_writes_a_search_that_runs_and_overwrites_nothing(folder: Path) -> 
 
 
 @pytest.mark.slow
-def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path) -> None:
+def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder, SEARCH + "seeds: [0, 1]\n")
+    measured: dict[str, dict[str, float]] = {}
+    monkeypatch.setattr("search.studies.cost.measure", lambda run: measured.setdefault("small", measure(run)))
     output = run("search", "small.yml", "--workers", 4, "--dry-run")
     row = next(line for line in output.splitlines() if line.startswith("│ small"))
-    runs, steps, gradient_steps, step_ms, gradient_ms, hours, core_hours, _ = map(float, row.replace("│", "").split()[1:])
+    runs, steps, gradient_steps, *shown, _ = map(float, row.replace("│", "").split()[1:])
     # 2 random ones and a prior, then 3; two seeds. Training begins after 40 steps.
     assert (runs, steps, gradient_steps) == (12, 400, 360)
-    # And two evaluations of an episode of 200 steps. Two digits are shown: each side is rounded by up to 5 %.
-    assert hours == pytest.approx((800 * step_ms + 360 * gradient_ms) / 3.6e6, rel=0.11)
-    assert core_hours == pytest.approx(12 * hours, rel=0.11)
+    names = ("ms an environment step", "ms a gradient step", "hours of a run")
+    step_ms, gradient_ms, hours = (measured["small"][name] for name in names)
+    # And two evaluations of an episode of 200 steps.
+    assert hours == pytest.approx((800 * step_ms + 360 * gradient_ms) / 3.6e6)
+    assert shown == [float(f"{value:.2g}") for value in (step_ms, gradient_ms, hours, 12 * hours)]
     assert "All: 12 runs" in output and "with --workers 4" in output
     assert not Path("runs").exists()
 
