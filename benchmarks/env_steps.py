@@ -27,13 +27,13 @@ from gymnasium.wrappers import TimeLimit
 from rich.console import Console
 from rich.table import Table
 from saving import save_result
+from sb3_aarl.search.training.config import VEC_ENVS
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import LearningCurveCallback, SingleEpisodes
 from sb3_aarl.envs import make_dmc_env
-from search.training.config import VEC_ENVS
 
 ACTION_REPEAT = 4
 EPISODES = 10

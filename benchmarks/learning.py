@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sb3_aarl.search.training.provenance import provenance
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import LearningCurveCallback
 from sb3_aarl.envs import make_dmc_env
-from search.training.provenance import provenance
 
 
 class AuxLossRecorder(BaseCallback):

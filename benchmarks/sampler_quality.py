@@ -22,11 +22,11 @@ from typing import Protocol
 import numpy as np
 import optuna
 from saving import save_result
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import MAX_HORIZON, random_loss, suggest_aux_loss
 from scipy.stats import mannwhitneyu
 
 from sb3_aarl.aux_loss import AuxLoss, Token
-from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import MAX_HORIZON, random_loss, suggest_aux_loss
 
 N_TOKENS = 3 * MAX_HORIZON + 1
 SAMPLERS: dict[str, Callable[[int], optuna.samplers.BaseSampler]] = {

@@ -16,9 +16,8 @@ import numpy as np
 import optuna
 from optuna.samplers import BaseSampler, NSGAIISampler
 from saving import save_result
-
-from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import suggest_aux_loss
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import suggest_aux_loss
 
 SAMPLERS: dict[str, Callable[[], BaseSampler]] = {
     "AuxLossSampler": lambda: AuxLossSampler(seed=0),

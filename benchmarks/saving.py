@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from search.training.provenance import provenance
+from sb3_aarl.search.training.provenance import provenance
 
 
 def save_result(path: Path, **result: Any) -> None:

@@ -18,8 +18,7 @@ import tempfile
 from pathlib import Path
 
 import stable_baselines3
-
-from search.training.provenance import provenance
+from sb3_aarl.search.training.provenance import provenance
 
 # By default all tests that run SAC, and those of what SACAux has of its own (replay buffer, n-step returns, gSDE).
 SELECTION = "SAC or sac or sde or n_step or buffer"

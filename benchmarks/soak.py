@@ -19,9 +19,8 @@ import optuna
 import psutil
 from optuna.trial import TrialState
 from saving import save_result
-
-from search.evolution.space import loss_of
-from search.execution.storage import open_storage
+from sb3_aarl.search.evolution.space import loss_of
+from sb3_aarl.search.execution.storage import open_storage
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from postgres import Postgres
@@ -79,7 +78,7 @@ def main() -> None:
         folder = Path(name)
         (folder / "expected").mkdir()
         subprocess.run(
-            [sys.executable, "-m", "search.cli.main", "search", str(write_search(folder / "expected", text))],
+            [sys.executable, "-m", "sb3_aarl.search.cli.main", "search", str(write_search(folder / "expected", text))],
             cwd=folder / "expected",
             check=True,
         )

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import gymnasium as gym
 import optuna
-
-from search.evolution.sampler import AuxLossSampler
-from search.execution.driver import Driver
-from search.execution.runs import LocalExecutor
-from search.execution.storage import open_storage
-from search.training.run import Run
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.execution.driver import Driver
+from sb3_aarl.search.execution.runs import LocalExecutor
+from sb3_aarl.search.execution.storage import open_storage
+from sb3_aarl.search.training.run import Run
 
 FOLDER = Path("runs/examples/search")
 HYPERPARAMETERS = {"learning_starts": 100, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}

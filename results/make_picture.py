@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import pandas as pd
-
-from search.results.plots import learning_curves_plot
-from search.studies.benchmark import read_curves
+from sb3_aarl.search.results.plots import learning_curves_plot
+from sb3_aarl.search.studies.benchmark import read_curves
 
 RESULTS = Path(__file__).parent
 FOLDERS = ("confirmation", "simba", "choices_small")

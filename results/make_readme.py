@@ -13,19 +13,19 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from sb3_aarl.search.cli.main import app
+from sb3_aarl.search.execution.matrix import stored_scores
+from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
+from sb3_aarl.search.results.analysis import analysed, trial_table
+from sb3_aarl.search.results.table import closest_table, paper_scores
+from sb3_aarl.search.studies.benchmark import read_abouts, task_name
+from sb3_aarl.search.studies.cross_validation import ranking
+from sb3_aarl.search.studies.search import SETTINGS_KEY
+from sb3_aarl.search.training.provenance import read_about
 from scipy.stats import mannwhitneyu
 from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import read_curve
-from search.cli.main import app
-from search.execution.matrix import stored_scores
-from search.execution.storage import STUDY_FILE, load_study, open_storage
-from search.results.analysis import analysed, trial_table
-from search.results.table import closest_table, paper_scores
-from search.studies.benchmark import read_abouts, task_name
-from search.studies.cross_validation import ranking
-from search.studies.search import SETTINGS_KEY
-from search.training.provenance import read_about
 
 RESULTS = Path(__file__).parent
 ABOUT = "about.md"

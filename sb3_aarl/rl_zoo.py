@@ -25,7 +25,6 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -83,7 +82,7 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     known, _ = parser.parse_known_args(arguments)
     path = known.conf_file
     if path is None and known.algo == "sac_aux":
-        ours = Path(__file__).parents[1] / "zoo_configs/aarl_state.yml"
+        ours = files("sb3_aarl.zoo_configs") / "aarl_state.yml"
         theirs = files("rl_zoo3") / "hyperparams/sac.yml"
         path = str(ours if str(known.env).startswith(PREFIX) else theirs)
         arguments = [*arguments, "-conf", path]

@@ -43,9 +43,9 @@ def postgres() -> Iterator[Postgres]:
 def executor(monkeypatch: pytest.MonkeyPatch) -> Planted:
     """In the place of this machine's processes."""
     executor = Planted()
-    monkeypatch.setattr("search.execution.runs.LocalExecutor", executor)
-    monkeypatch.setattr("search.execution.matrix.POLL_SECONDS", 0)
-    monkeypatch.setattr("search.execution.driver.POLL_SECONDS", 0)
+    monkeypatch.setattr("sb3_aarl.search.execution.runs.LocalExecutor", executor)
+    monkeypatch.setattr("sb3_aarl.search.execution.matrix.POLL_SECONDS", 0)
+    monkeypatch.setattr("sb3_aarl.search.execution.driver.POLL_SECONDS", 0)
     return executor
 
 

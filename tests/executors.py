@@ -4,8 +4,9 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+from sb3_aarl.search.training.run import Run, read_run, train
+
 from sb3_aarl.callbacks import Evaluation, write_curve
-from search.training.run import Run, read_run, train
 
 
 class InProcess:

@@ -10,7 +10,7 @@ from pathlib import Path
 def start(*arguments: object, folder: Path) -> subprocess.Popen[str]:
     """The program, in a process group of its own."""
     return subprocess.Popen(
-        [sys.executable, "-m", "search.cli.main", *map(str, arguments)],
+        [sys.executable, "-m", "sb3_aarl.search.cli.main", *map(str, arguments)],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "COLUMNS": "200"},
         stdout=subprocess.PIPE,

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+from sb3_aarl.search.results import analysis
 from test_space import losses
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
-from search.results import analysis
 
 # Section 3.3, typed in again.
 PATTERNS = {

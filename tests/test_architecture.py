@@ -23,21 +23,21 @@ def test_imports_go_downwards() -> None:
     for path in ROOT.glob("search/*/*.py"):
         own = path.parent.name
         for name in imports(path):
-            other = name.split(".")[1] if name.startswith("search.") else own
+            other = name.split(".")[2] if name.startswith("sb3_aarl.search.") else own
             if floor(other) > floor(own) or (floor(own) == 0 and other != own):
                 wrong.append(f"{path.relative_to(ROOT)} imports {name}")
     wrong += [
         f"{path.name} imports {name}"
         for path in ROOT.glob("sb3_aarl/*.py")
         for name in imports(path)
-        if name.startswith("search")
+        if name.startswith("sb3_aarl.search")
     ]
     assert not wrong
 
 
 def test_results_read_and_never_start_runs() -> None:
     for path in ROOT.glob("search/results/*.py"):
-        assert not {"search.execution.driver", "search.execution.ray"} & set(imports(path)), path.name
+        assert not {"sb3_aarl.search.execution.driver", "sb3_aarl.search.execution.ray"} & set(imports(path)), path.name
     for path in ROOT.glob("search/*/*.py"):
         if path.parent.name != "execution":
             assert not {"subprocess", "multiprocessing"} & set(imports(path)) or path.name == "provenance.py", path.name

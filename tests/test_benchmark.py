@@ -10,19 +10,19 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from sb3_aarl.search.execution.matrix import Cell, cell_folder, comparable, run_matrix, scores
+from sb3_aarl.search.execution.runs import LocalExecutor
+from sb3_aarl.search.results import table
+from sb3_aarl.search.studies import benchmark
+from sb3_aarl.search.studies.benchmark import load_benchmark, parse_seeds, parse_steps, read_abouts, read_curves
+from sb3_aarl.search.studies.status import matrix_status
+from sb3_aarl.search.training import provenance
+from sb3_aarl.search.training.config import load_hyperparameters
+from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
+from sb3_aarl.search.training.run import prepare_run, read_outcome, train
 from tiny import YAML
 
 from sb3_aarl.callbacks import Evaluation, aulc, read_curve, write_curve
-from search.execution.matrix import Cell, cell_folder, comparable, run_matrix, scores
-from search.execution.runs import LocalExecutor
-from search.results import table
-from search.studies import benchmark
-from search.studies.benchmark import load_benchmark, parse_seeds, parse_steps, read_abouts, read_curves
-from search.studies.status import matrix_status
-from search.training import provenance
-from search.training.config import load_hyperparameters
-from search.training.provenance import ABOUT, read_about, write_about
-from search.training.run import prepare_run, read_outcome, train
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 OWN = YAML.replace("default:", "Pendulum-v1:\n  aux_loss: curl\n  n_timesteps: 400")
@@ -177,7 +177,9 @@ def test_runs_that_were_copied_together_are_compared_only_if_trained_alike(folde
 
 def test_the_time_to_go_is_that_of_the_steps_that_are_left(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seconds = iter([0.0, 10.0, 20.0])
-    monkeypatch.setattr("search.execution.matrix.time", SimpleNamespace(monotonic=lambda: next(seconds), sleep=lambda _: None))
+    monkeypatch.setattr(
+        "sb3_aarl.search.execution.matrix.time", SimpleNamespace(monotonic=lambda: next(seconds), sleep=lambda _: None)
+    )
     matrix = load("mine.yml", seeds=[0, 1], checkpoints=[80], every=20)
     paths = [cell_folder(Path("out"), cell) for cell in matrix.runs]
     future: Future[Any] = Future()

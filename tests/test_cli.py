@@ -14,16 +14,16 @@ import yaml
 from executors import Planted
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState, create_trial
+from sb3_aarl.search.cli.main import app
+from sb3_aarl.search.cli.options import read_config
+from sb3_aarl.search.evolution.space import distributions, loss_to_params
+from sb3_aarl.search.execution.storage import open_storage
+from sb3_aarl.search.training.shipped import ZOO
 from tiny import SEARCH, YAML, write_search
 from typer.testing import CliRunner
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 from sb3_aarl.callbacks import read_curve
-from search.cli.main import app
-from search.cli.options import read_config
-from search.evolution.space import distributions, loss_to_params
-from search.execution.storage import open_storage
-from search.training.shipped import ZOO
 
 ROOT = Path(__file__).parent.parent
 runner = CliRunner(env={"COLUMNS": "200", "TERM": "dumb"})
@@ -143,7 +143,7 @@ def test_all_files_are_installed() -> None:
 
 def test_the_help_needs_nothing_heavy() -> None:
     program = (
-        "import sys; from typer.testing import CliRunner; from search.cli.main import app; "
+        "import sys; from typer.testing import CliRunner; from sb3_aarl.search.cli.main import app; "
         "[CliRunner().invoke(app, [*command, '--help']) for command in ([], ['figures'], ['search'], ['analyze'])]; "
         "print([name for name in ('torch', 'optuna', 'pandas', 'matplotlib', 'plotly') if name in sys.modules])"
     )
@@ -206,7 +206,7 @@ def test_errors_have_no_password(folder: Path) -> None:
 
 def test_a_missing_extra_is_named(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder)
-    monkeypatch.delitem(sys.modules, "search.execution.ray", raising=False)
+    monkeypatch.delitem(sys.modules, "sb3_aarl.search.execution.ray", raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
     assert "pip install 'sb3-aarl[ray]'" in run("search", "small.yml", "--executor", "ray", code=2)
 
@@ -231,7 +231,7 @@ def test_search_reports_progress_and_resumes(folder: Path, executor: Planted) ->
 def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray")
     write_search(folder, SMALLER)
-    monkeypatch.setattr("search.execution.ray.RayExecutor", executor)
+    monkeypatch.setattr("sb3_aarl.search.execution.ray.RayExecutor", executor)
     options = "--executor ray --ray-address host:1 --cpus-per-run 2 --gpus-per-run 0.25 --generations 1"
     run("search", "small.yml", *options.split())
     assert executor.arguments == ("host:1", 2.0, 0.25) and len(executor.runs) == 2
@@ -240,7 +240,7 @@ def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Planted, monk
 @pytest.mark.slow
 def test_a_search_in_which_all_fails_is_exit_code_1(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder, SMALLER)
-    monkeypatch.setattr("search.execution.driver.MAX_FAILURES", 2)
+    monkeypatch.setattr("sb3_aarl.search.execution.driver.MAX_FAILURES", 2)
     executor.fails = lambda run: True
     output = run("search", "small.yml", code=1)
     assert "Error: 2 candidates failed one after the other, the last one: it burst (see runs/small/candidates/" in output

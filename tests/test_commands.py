@@ -10,19 +10,19 @@ import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+import sb3_aarl.search.cli.console
 from executors import Planted
 from filelock import FileLock
+from sb3_aarl.search.cli.main import app
+from sb3_aarl.search.studies.config import load_config
+from sb3_aarl.search.studies.cost import measure
+from sb3_aarl.search.training.run import prepare_run, train
+from sb3_aarl.search.training.shipped import ZOO, find_file, shipped_files
 from tiny import HYPERPARAMETERS, SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
 
-import search.cli.console
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import read_curve
-from search.cli.main import app
-from search.studies.config import load_config
-from search.studies.cost import measure
-from search.training.run import prepare_run, train
-from search.training.shipped import ZOO, find_file, shipped_files
 
 runner = CliRunner(env={"COLUMNS": "200", "TERM": "dumb"})
 BASELINES = SEARCH + "baselines:\n- {name: SAC}\n- {name: CURL, aux_loss: curl}\n"
@@ -83,7 +83,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the program runs."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("search.studies.cost.MEASURED_SECONDS", 0.2)
+    monkeypatch.setattr("sb3_aarl.search.studies.cost.MEASURED_SECONDS", 0.2)
     return tmp_path
 
 
@@ -174,7 +174,7 @@ def test_init_writes_a_search_that_runs_and_overwrites_nothing(folder: Path) -> 
 def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder, SEARCH + "seeds: [0, 1]\n")
     measured: dict[str, dict[str, float]] = {}
-    monkeypatch.setattr("search.studies.cost.measure", lambda run: measured.setdefault("small", measure(run)))
+    monkeypatch.setattr("sb3_aarl.search.studies.cost.measure", lambda run: measured.setdefault("small", measure(run)))
     output = run("search", "small.yml", "--workers", 4, "--dry-run")
     row = next(line for line in output.splitlines() if line.startswith("│ small"))
     runs, steps, gradient_steps, *shown, _ = map(float, row.replace("│", "").split()[1:])
@@ -237,10 +237,10 @@ def test_a_log_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str], monke
             show(f"{done} done, 0:01:00 to go", done)
         return [line.partition(" ")[2] for line in capsys.readouterr().err.splitlines()]
 
-    with search.cli.console.live() as show:
+    with sb3_aarl.search.cli.console.live() as show:
         assert shown(show) == ["1 done, 0:01:00 to go", "2 done, 0:01:00 to go"]
-    monkeypatch.setattr(search.cli.console, "LINE_SECONDS", 0.0)
-    with search.cli.console.live() as show:
+    monkeypatch.setattr(sb3_aarl.search.cli.console, "LINE_SECONDS", 0.0)
+    with sb3_aarl.search.cli.console.live() as show:
         assert len(shown(show)) == 3
 
 

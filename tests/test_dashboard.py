@@ -10,13 +10,12 @@ import optuna_dashboard
 import pytest
 from browser import open_browser, requested
 from optuna.trial import TrialState
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import loss_of, suggest_aux_loss
+from sb3_aarl.search.execution.storage import open_storage
+from sb3_aarl.search.results import dashboard
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
-
-from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import loss_of, suggest_aux_loss
-from search.execution.storage import open_storage
-from search.results import dashboard
 
 EVIL = "<script>document.title='owned'</script> ![x](https://example.org/x.png) **bold** | `code`\n# www.example.org"
 BASELINES = [("SAC", 90.0), ("CURL", 110.0)]

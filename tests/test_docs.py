@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 import typer
+from sb3_aarl.search.cli.main import app
+from sb3_aarl.search.studies.config import load_config
+from sb3_aarl.search.training.config import load_hyperparameters, read_yaml
 from tiny import SEARCH, write_search
 
 from sb3_aarl import AuxLoss, rl_zoo
-from search.cli.main import app
-from search.studies.config import load_config
-from search.training.config import load_hyperparameters, read_yaml
 
 ROOT = Path(__file__).parent.parent
 PAGES = {path.relative_to(ROOT).as_posix(): path for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]}

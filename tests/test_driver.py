@@ -11,16 +11,16 @@ import pytest
 from optuna.pruners import ThresholdPruner
 from optuna.storages import BaseStorage, InMemoryStorage
 from optuna.trial import TrialState
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import loss_of, loss_to_params, suggest_aux_loss
+from sb3_aarl.search.execution import driver
+from sb3_aarl.search.execution.driver import Driver
+from sb3_aarl.search.execution.runs import RunFailed
+from sb3_aarl.search.execution.storage import open_storage
+from sb3_aarl.search.training.run import Run
 
 from sb3_aarl import AuxLoss
 from sb3_aarl.callbacks import Evaluation, write_curve
-from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import loss_of, loss_to_params, suggest_aux_loss
-from search.execution import driver
-from search.execution.driver import Driver
-from search.execution.runs import RunFailed
-from search.execution.storage import open_storage
-from search.training.run import Run
 
 CHECKPOINTS = (100, 200, 300)
 SETTINGS: dict[str, Any] = {"population_size": 6, "n_random": 5, "n_prior": 2, "max_horizon": 3, "n_generations": 3, "seed": 7}

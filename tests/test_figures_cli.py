@@ -10,17 +10,17 @@ import optuna
 import pytest
 import scipy.stats
 from optuna.trial import TrialState, create_trial
+from sb3_aarl.search.cli.main import app
+from sb3_aarl.search.evolution.space import distributions, loss_to_params, random_loss
+from sb3_aarl.search.execution.matrix import Cell, cell_folder
+from sb3_aarl.search.execution.storage import load_study, open_storage
+from sb3_aarl.search.studies.benchmark import read_curves
+from sb3_aarl.search.training.provenance import write_about
+from sb3_aarl.search.training.run import prepare_run
 from tiny import tiny_run
 from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import Evaluation, write_curve
-from search.cli.main import app
-from search.evolution.space import distributions, loss_to_params, random_loss
-from search.execution.matrix import Cell, cell_folder
-from search.execution.storage import load_study, open_storage
-from search.studies.benchmark import read_curves
-from search.training.provenance import write_about
-from search.training.run import prepare_run
 
 runner = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"})
 FIGURES = ("evolution", "histogram", "rankings", "patterns")

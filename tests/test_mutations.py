@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sb3_aarl.search.evolution.mutations import crossover, horizon_change, replacement
+from sb3_aarl.search.evolution.space import random_loss
 from scipy.stats import binom, binomtest, chi2_contingency, chisquare
 from test_space import losses
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution.mutations import crossover, horizon_change, replacement
-from search.evolution.space import random_loss
 
 PARENT = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 seeds = st.integers(0, 2**32)

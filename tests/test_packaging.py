@@ -24,9 +24,12 @@ def python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
 
 
-def test_without_extras_an_agent_is_trained(tmp_path: Path) -> None:
+def test_without_extras_an_agent_is_trained_beside_a_module_called_search(tmp_path: Path) -> None:
+    for name in ("search.py", "zoo_configs.py"):  # the user's own
+        (tmp_path / name).write_text("raise SystemExit('not the package')")
     agent = "from sb3_aarl import SACAux\nSACAux('MlpPolicy', 'Pendulum-v1', aux_loss='forward-dynamics').learn(110)\n"
-    program = "from search.cli.main import app\napp('train Pendulum-v1 --steps 40 --evaluations 1 --episodes 1'.split())"
+    train = "train Pendulum-v1 --steps 40 --evaluations 1 --episodes 1"
+    program = f"from sb3_aarl.search.cli.main import app\napp({train!r}.split())"
     ran = python(BARE + agent + program, tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert list(tmp_path.rglob("model.zip"))
@@ -36,9 +39,9 @@ def test_without_extras_an_agent_is_trained(tmp_path: Path) -> None:
     ("code", "extra"),
     [
         ("from sb3_aarl.envs import make_dmc_env\nmake_dmc_env('cheetah-run')", "dmc"),
-        ("from search.cli.main import app\napp(['train', 'cheetah-run'])", "dmc"),
-        ("from search.training.config import resolve_env_id\nresolve_env_id('dm_control/cheetah-run-v0')", "dmc"),
-        ("from search.cli.main import app\napp(['search', 'demo'])", "search"),
+        ("from sb3_aarl.search.cli.main import app\napp(['train', 'cheetah-run'])", "dmc"),
+        ("from sb3_aarl.search.training.config import resolve_env_id\nresolve_env_id('dm_control/cheetah-run-v0')", "dmc"),
+        ("from sb3_aarl.search.cli.main import app\napp(['search', 'demo'])", "search"),
     ],
 )
 def test_what_needs_an_extra_names_it_in_one_line(code: str, extra: str, tmp_path: Path) -> None:

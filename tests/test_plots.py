@@ -14,11 +14,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
-
-from sb3_aarl.aux_loss import AuxLoss
-from search.evolution.space import distributions, loss_to_params, random_loss
-from search.results import analysis
-from search.results.plots import (
+from sb3_aarl.search.evolution.space import distributions, loss_to_params, random_loss
+from sb3_aarl.search.results import analysis
+from sb3_aarl.search.results.plots import (
     evolution_figure,
     evolution_plot,
     histogram_plot,
@@ -26,6 +24,8 @@ from search.results.plots import (
     patterns_plot,
     rankings_plot,
 )
+
+from sb3_aarl.aux_loss import AuxLoss
 
 LOSS = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
 BASELINES = [("SAC", 12.5), ("<b>CURL</b>", -3.0)]

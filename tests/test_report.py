@@ -11,15 +11,15 @@ from browser import open_browser, requested
 from optuna.distributions import FloatDistribution
 from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, TrialState
+from sb3_aarl.search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
+from sb3_aarl.search.execution.matrix import Cell, cell_folder, stored_scores
+from sb3_aarl.search.results import analysis
+from sb3_aarl.search.results.report import generation_table, stored_baselines, write_report
+from sb3_aarl.search.training.provenance import write_about
+from sb3_aarl.search.training.run import Run, prepare_run
 from selenium.webdriver.common.by import By
 
 from sb3_aarl.callbacks import Evaluation, write_curve
-from search.evolution.space import distributions, loss_to_params, random_loss, suggest_aux_loss
-from search.execution.matrix import Cell, cell_folder, stored_scores
-from search.results import analysis
-from search.results.report import generation_table, stored_baselines, write_report
-from search.training.provenance import write_about
-from search.training.run import Run, prepare_run
 
 START = datetime(2026, 1, 1)
 EVIL = "<script>document.title='owned'</script><img src=https://example.org/x.png>"

@@ -16,24 +16,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sb3_aarl.search.cli.main import app
+from sb3_aarl.search.execution.matrix import cell_folder, stored_scores
+from sb3_aarl.search.execution.storage import load_study, open_storage
+from sb3_aarl.search.results.analysis import analysed, trial_table
+from sb3_aarl.search.results.report import stored_baselines
+from sb3_aarl.search.results.statistics import interquartile_means
+from sb3_aarl.search.results.table import paper_scores, read_runs
+from sb3_aarl.search.studies import benchmark
+from sb3_aarl.search.studies.benchmark import load_benchmark, read_abouts
+from sb3_aarl.search.studies.cross_validation import ranking
+from sb3_aarl.search.training.config import read_yaml
+from sb3_aarl.search.training.provenance import ABOUT
 from scipy.stats import mannwhitneyu
 from typer.testing import CliRunner
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from sb3_aarl.catalog import resolve
-from search.cli.main import app
-from search.execution.matrix import cell_folder, stored_scores
-from search.execution.storage import load_study, open_storage
-from search.results.analysis import analysed, trial_table
-from search.results.report import stored_baselines
-from search.results.statistics import interquartile_means
-from search.results.table import paper_scores, read_runs
-from search.studies import benchmark
-from search.studies.benchmark import load_benchmark, read_abouts
-from search.studies.cross_validation import ranking
-from search.training.config import read_yaml
-from search.training.provenance import ABOUT
 
 RESULTS = Path(__file__).parent.parent / "results"
 make_readme: dict[str, Any] = runpy.run_path(str(RESULTS / "make_readme.py"))

@@ -16,13 +16,13 @@ import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from sb3_aarl.search.training import checkpoint, run
+from sb3_aarl.search.training.checkpoint import TruncateAt, restart_seed
+from sb3_aarl.search.training.run import Run, prepare_run, train
 from tiny import DENSE
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import read_curve
-from search.training import checkpoint, run
-from search.training.checkpoint import TruncateAt, restart_seed
-from search.training.run import Run, prepare_run, train
 
 HYPER: dict[str, Any] = {"env_kwargs": {}, **DENSE}
 PIXELS = {"pixels": True, "image_size": 16, "frame_stack": 2, "fast_rendering": True}
@@ -52,7 +52,7 @@ def processes() -> ForkServerContext:
     """Processes that start with everything imported."""
     context = multiprocessing.get_context("forkserver")
     # Those that DeepMind Control and the first optimizer import.
-    context.set_forkserver_preload(["search.training.run", "shimmy", "torch._dynamo"])
+    context.set_forkserver_preload(["sb3_aarl.search.training.run", "shimmy", "torch._dynamo"])
     return context
 
 

@@ -13,17 +13,10 @@ import pytest
 from filelock import FileLock, Timeout
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.vec_env import VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import DENSE
-
-from sb3_aarl import SACAux
-from sb3_aarl.callbacks import Evaluation, read_curve
-from sb3_aarl.health import NonFiniteError
-from search.training import run as module
-from search.training.config import ConfigError
-from search.training.provenance import read_about, write_about
-from search.training.run import (
+from sb3_aarl.search.training import run as module
+from sb3_aarl.search.training.config import ConfigError
+from sb3_aarl.search.training.provenance import read_about, write_about
+from sb3_aarl.search.training.run import (
     Outcome,
     Run,
     Setup,
@@ -36,6 +29,13 @@ from search.training.run import (
     spread_checkpoints,
     train,
 )
+from stable_baselines3.common.vec_env import VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tiny import DENSE
+
+from sb3_aarl import SACAux
+from sb3_aarl.callbacks import Evaluation, read_curve
+from sb3_aarl.health import NonFiniteError
 
 
 class Walk(gym.Env):
@@ -101,7 +101,7 @@ def make_run(**changes: Any) -> Run:
 
 
 def run_program(folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str) -> None:
-    """``python -m search.training.run`` in this process."""
+    """``python -m sb3_aarl.search.training.run`` in this process."""
     monkeypatch.setattr(sys, "argv", ["run.py", str(folder), *options])
     module.main()
 
@@ -264,7 +264,7 @@ def test_an_environment_that_ends_its_process_leaves_no_outcome(tmp_path: Path) 
     """And the modules that register environments are found in the working directory."""
     (tmp_path / "exits.py").write_text(EXITS)
     prepare_run(tmp_path / "run", make_run(environment="Exits-v0", imports=("exits",), checkpoints=(10, 30)))
-    program = [sys.executable, "-m", "search.training.run", str(tmp_path / "run")]
+    program = [sys.executable, "-m", "sb3_aarl.search.training.run", str(tmp_path / "run")]
     assert subprocess.run(program, cwd=tmp_path, capture_output=True).returncode == 3
     assert read_outcome(tmp_path / "run") is None
 

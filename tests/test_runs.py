@@ -6,18 +6,18 @@ from typing import Any
 
 import psutil
 import pytest
+from sb3_aarl.search.execution.runs import LocalExecutor, Submission, mean_curve
+from sb3_aarl.search.training.run import is_finished
 from tiny import tiny_run
 
 from sb3_aarl.callbacks import Evaluation
-from search.execution.runs import LocalExecutor, Submission, mean_curve
-from search.training.run import is_finished
 
 pytestmark = pytest.mark.slow
 
 
 def children() -> list[int]:
     """Processes of runs that this one has started."""
-    return [process.pid for process in psutil.Process().children() if "search.training.run" in process.cmdline()]
+    return [process.pid for process in psutil.Process().children() if "sb3_aarl.search.training.run" in process.cmdline()]
 
 
 def wait_done(submission: Submission) -> None:

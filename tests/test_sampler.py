@@ -18,13 +18,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, TrialState
+from sb3_aarl.search.evolution import mutations
+from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
+from sb3_aarl.search.evolution.space import PRIORS, loss_of, loss_to_params, params_to_loss, random_loss, suggest_aux_loss
+from sb3_aarl.search.evolution.surrogate import features
 from sklearn.linear_model import BayesianRidge
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution import mutations
-from search.evolution.sampler import AuxLossSampler, GenerationProgress
-from search.evolution.space import PRIORS, loss_of, loss_to_params, params_to_loss, random_loss, suggest_aux_loss
-from search.evolution.surrogate import features
 
 SMALL: dict[str, Any] = {"population_size": 12, "n_random": 8, "n_prior": 4, "max_horizon": 2, "n_generations": 3, "seed": 0}
 WANTED = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")

@@ -17,15 +17,14 @@ from executors import InProcess
 from optuna.trial import TrialState
 from postgres import Postgres
 from program import aarl, start
+from sb3_aarl.search.cli.main import app
+from sb3_aarl.search.evolution.space import loss_of
+from sb3_aarl.search.execution.driver import Driver
+from sb3_aarl.search.execution.storage import open_storage
+from sb3_aarl.search.studies.config import load_config
+from sb3_aarl.search.studies.search import open_search, runs_of
 from tiny import SEARCH, write_search
 from typer.testing import CliRunner
-
-from search.cli.main import app
-from search.evolution.space import loss_of
-from search.execution.driver import Driver
-from search.execution.storage import open_storage
-from search.studies.config import load_config
-from search.studies.search import open_search, runs_of
 
 pytestmark = pytest.mark.slow
 # A generation of random losses and a prior, and one with a crossover and a mutation.
@@ -60,7 +59,7 @@ def runs_of_driver(pid: int) -> list[int]:
     found = []
     for process in psutil.Process(pid).children():
         with contextlib.suppress(psutil.NoSuchProcess):  # it has just ended
-            if "search.training.run" in process.cmdline():
+            if "sb3_aarl.search.training.run" in process.cmdline():
                 found.append(process.pid)
     return found
 
@@ -129,7 +128,7 @@ def test_postgresql_restarts_in_the_middle(
             return super().submit(fn, path)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("search.execution.runs.LocalExecutor", lambda workers: Restarting())
+    monkeypatch.setattr("sb3_aarl.search.execution.runs.LocalExecutor", lambda workers: Restarting())
     url = postgres.create("restarted")
     result = CliRunner().invoke(app, ["search", str(write_search(tmp_path, SHORT)), "--storage", url])
     assert result.exit_code == 0, result.output
@@ -153,7 +152,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def test_a_ray_node_is_removed(tmp_path: Path, undisturbed: Slots, cluster: Any) -> None:
-    from search.execution.ray import RayExecutor
+    from sb3_aarl.search.execution.ray import RayExecutor
 
     config, folder = load_config(write_search(tmp_path, SHORT)), tmp_path / "runs/small"
     storage = open_storage(folder)

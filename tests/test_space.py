@@ -12,11 +12,8 @@ from hypothesis import strategies as st
 from optuna.distributions import CategoricalDistribution, IntDistribution
 from optuna.samplers import BaseSampler, RandomSampler, TPESampler
 from optuna.trial import FixedTrial, TrialState
-from scipy.stats import binomtest, chisquare
-
-from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import (
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import (
     check_operators,
     distributions,
     forward_dynamics_prior,
@@ -27,6 +24,9 @@ from search.evolution.space import (
     reward_prediction_prior,
     suggest_aux_loss,
 )
+from scipy.stats import binomtest, chisquare
+
+from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
 GENERATORS = {"random": random_loss, "forward dynamics": forward_dynamics_prior, "rewards": reward_prediction_prior}
 

@@ -10,17 +10,17 @@ import pytest
 from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import InMemoryStorage
 from optuna.trial import create_trial
+from sb3_aarl.search.evolution.space import distributions, loss_to_params, random_loss
+from sb3_aarl.search.evolution.surrogate import features
+from sb3_aarl.search.execution.matrix import Cell
+from sb3_aarl.search.studies import cross_validation, operator_selection
+from sb3_aarl.search.studies.config import SearchConfig, load_config
+from sb3_aarl.search.studies.search import SETTINGS_KEY, baselines, make_pruner, open_search, runs_of
+from sb3_aarl.search.training.config import ConfigError
 from sklearn.linear_model import BayesianRidge
 from tiny import SEARCH, write_search
 
 from sb3_aarl import AuxLoss, catalog
-from search.evolution.space import distributions, loss_to_params, random_loss
-from search.evolution.surrogate import features
-from search.execution.matrix import Cell
-from search.studies import cross_validation, operator_selection
-from search.studies.config import SearchConfig, load_config
-from search.studies.search import SETTINGS_KEY, baselines, make_pruner, open_search, runs_of
-from search.training.config import ConfigError
 
 PARTS = """\
 cross_validation:

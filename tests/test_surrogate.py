@@ -4,11 +4,11 @@ import sys
 
 import numpy as np
 import pytest
+from sb3_aarl.search.evolution.space import random_loss
+from sb3_aarl.search.evolution.surrogate import TokenModel, features
 from sklearn.linear_model import BayesianRidge
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution.space import random_loss
-from search.evolution.surrogate import TokenModel, features
 
 
 def trials(n: int, max_horizon: int = 10, seed: int = 0) -> tuple[list[AuxLoss], np.ndarray]:

@@ -12,13 +12,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
+from sb3_aarl.search.execution.matrix import Cell, cell_folder
+from sb3_aarl.search.results import table
+from sb3_aarl.search.training.provenance import ABOUT
 from scipy import stats
 
 from sb3_aarl.callbacks import Evaluation, write_curve
 from sb3_aarl.envs import env_ids
-from search.execution.matrix import Cell, cell_folder
-from search.results import table
-from search.training.provenance import ABOUT
 
 # The paper's tables as its text has them; table 3 and the first part of table 4 have the asterisks and daggers left out.
 PAPER = {

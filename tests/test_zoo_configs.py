@@ -11,11 +11,11 @@ import gymnasium as gym
 import pytest
 import torch as th
 import yaml
+from sb3_aarl.search.training.config import load_hyperparameters, merge
 from stable_baselines3.common.logger import Logger
 
 from sb3_aarl import SACAux, catalog, encoders
 from sb3_aarl.envs import env_ids, make_dmc_env
-from search.training.config import load_hyperparameters, merge
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 FILES = sorted(path for folder in ("", "choices", "body", "defaults", "simba") for path in (ZOO / folder).glob("*.yml"))

@@ -4,8 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-
-from search.training.run import Run
+from sb3_aarl.search.training.run import Run
 
 HYPERPARAMETERS: dict[str, Any] = {
     "policy": "MlpPolicy",

@@ -14,8 +14,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from search.training.run import Run
+    from sb3_aarl.search.training.run import Run
 
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
@@ -94,8 +93,7 @@ def print_wide(table: Table) -> None:
 def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
     """Measure one run of each kind, and show what all of them would cost, beside each other where there are cores for them."""
     import pandas as pd
-
-    from search.studies.cost import costs
+    from sb3_aarl.search.studies.cost import costs
 
     if not kinds:
         say("All runs are finished.")

@@ -7,10 +7,9 @@ from importlib import metadata
 from typing import Annotated, Any
 
 import typer
+from sb3_aarl.search.cli import matrices, results, search, train
+from sb3_aarl.search.cli.console import errors
 from typer.core import TyperGroup
-
-from search.cli import matrices, results, search, train
-from search.cli.console import errors
 
 # Training alone does without these modules; the extra that has them.
 EXTRAS = {"imageio": "search", "psycopg": "postgres", "ray": "ray"}
@@ -49,12 +48,11 @@ def explain(error: Exception) -> str | None:
         from gymnasium.error import Error
 
         kinds.append(Error)  # such as one about a library that renders
-    if "search.execution.storage" in sys.modules:
+    if "sb3_aarl.search.execution.storage" in sys.modules:
         from optuna.exceptions import StorageInternalError
+        from sb3_aarl.search.execution.runs import RunFailed
+        from sb3_aarl.search.training.provenance import hide_password
         from sqlalchemy.exc import SQLAlchemyError
-
-        from search.execution.runs import RunFailed
-        from search.training.provenance import hide_password
 
         kinds += [RunFailed, StorageInternalError, SQLAlchemyError]
         line = hide_password(line)

@@ -5,17 +5,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-
-from search.cli import options
-from search.cli.console import errors, live, records, say, say_json, show_costs, show_table, time_to_go
-from search.cli.options import Folder, Json, SearchFile, Storage, Threads, Workers, modules, read_config, run_folder
-from search.training.shipped import find_file
+from sb3_aarl.search.cli import options
+from sb3_aarl.search.cli.console import errors, live, records, say, say_json, show_costs, show_table, time_to_go
+from sb3_aarl.search.cli.options import Folder, Json, SearchFile, Storage, Threads, Workers, modules, read_config, run_folder
+from sb3_aarl.search.training.shipped import find_file
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from search.execution.matrix import Matrix
-    from search.training.run import Run
+    from sb3_aarl.search.execution.matrix import Matrix
+    from sb3_aarl.search.training.run import Run
 
 
 app = typer.Typer()
@@ -23,8 +21,8 @@ app = typer.Typer()
 
 def train_matrix(matrix: "Matrix", workers: int, retries: int = 3) -> None:
     """Train the runs of a matrix that are not finished, and show the progress."""
-    from search.execution.matrix import run_matrix
-    from search.execution.runs import LocalExecutor
+    from sb3_aarl.search.execution.matrix import run_matrix
+    from sb3_aarl.search.execution.runs import LocalExecutor
 
     with LocalExecutor(workers) as executor, live() as show:
         for progress in run_matrix(matrix, executor, workers, retries):
@@ -34,8 +32,8 @@ def train_matrix(matrix: "Matrix", workers: int, retries: int = 3) -> None:
 
 def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
     """The runs of a matrix that are not finished, by variant and environment."""
-    from search.execution.matrix import cell_folder, task_name
-    from search.training.run import is_finished
+    from sb3_aarl.search.execution.matrix import cell_folder, task_name
+    from sb3_aarl.search.training.run import is_finished
 
     kinds: dict[str, list[Run]] = {}
     for cell, run in matrix.runs.items():
@@ -48,7 +46,7 @@ def compare(
     matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str, json: bool
 ) -> "pd.DataFrame | None":
     """Show a table of the variants that can be compared, and return it."""
-    from search.execution.matrix import comparable, scores, task_name
+    from sb3_aarl.search.execution.matrix import comparable, scores, task_name
 
     compared = comparable(scores(matrix))
     ranked = None if compared.empty else table(compared)
@@ -62,8 +60,8 @@ def compare(
 
 def exit_if_failed(matrix: "Matrix") -> None:
     """Name the runs that failed, in one line each; exit code 1 if there are any."""
-    from search.execution.matrix import cell_folder
-    from search.training.run import read_outcome
+    from sb3_aarl.search.execution.matrix import cell_folder
+    from sb3_aarl.search.training.run import read_outcome
 
     outcomes = {cell: read_outcome(cell_folder(matrix.folder, cell)) for cell in matrix.runs}
     found = {cell: outcome.failure for cell, outcome in outcomes.items() if outcome and outcome.failure is not None}
@@ -79,8 +77,8 @@ def baselines(
     config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
 ) -> None:
     """Train the baselines of a search, which its candidates are compared with."""
-    from search.studies import search
-    from search.studies.cross_validation import ranking
+    from sb3_aarl.search.studies import search
+    from sb3_aarl.search.studies.cross_validation import ranking
 
     settings = read_config(config, threads=threads)
     if not settings.baselines:
@@ -96,7 +94,7 @@ def select_operator(
     config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
 ) -> None:
     """Compare the ten operators on forward dynamics, as in the paper's table 2."""
-    from search.studies import operator_selection
+    from sb3_aarl.search.studies import operator_selection
 
     settings = read_config(config, threads=threads)
     matrix = operator_selection.make_matrix(settings, run_folder(config, folder))
@@ -119,8 +117,8 @@ def cross_validate(
     json: Json = False,
 ) -> None:
     """Train the best candidates of a search on several environments, and write the winner as YAML."""
-    from search.execution.storage import load_study, open_storage
-    from search.studies import cross_validation
+    from sb3_aarl.search.execution.storage import load_study, open_storage
+    from sb3_aarl.search.studies import cross_validation
 
     settings = read_config(config, threads=threads)
     path = run_folder(config, folder)
@@ -174,8 +172,8 @@ def benchmark(
     json: Json = False,
 ) -> None:
     """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command resumes it."""
-    from search.cli.results import table
-    from search.studies.benchmark import load_benchmark, parse_seeds, parse_steps
+    from sb3_aarl.search.cli.results import table
+    from sb3_aarl.search.studies.benchmark import load_benchmark, parse_seeds, parse_steps
 
     names = [name.strip() for name in envs.split(",")] if envs else []
     steps = parse_steps(checkpoints) if checkpoints else ()

@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from sb3_aarl.search.training.shipped import find_file
 from typer import Argument, Option
-
-from search.training.shipped import find_file
 
 if TYPE_CHECKING:
     from optuna import Study
-
-    from search.studies.config import SearchConfig
+    from sb3_aarl.search.studies.config import SearchConfig
 
 logger = logging.getLogger(__name__)
 
@@ -61,9 +59,9 @@ def modules(imports: str) -> list[str]:
 
 def read_config(path: Path, **changes: Any) -> "SearchConfig":
     """The configuration of a search, with the values of options over those of its file; that its runs can start is checked."""
-    from search.studies.config import load_config
-    from search.studies.search import make_run
-    from search.training.run import check_run
+    from sb3_aarl.search.studies.config import load_config
+    from sb3_aarl.search.studies.search import make_run
+    from sb3_aarl.search.training.run import check_run
 
     config = load_config(path).model_copy(update={key: value for key, value in changes.items() if value is not None})
     setup = check_run(make_run(config, config.environment, None, config.seeds[0]))
@@ -80,7 +78,7 @@ def run_folder(config: Path, folder: Path | None) -> Path:
 
 def search_folder(folder: Path | None, storage: str | None) -> Path | None:
     """The folder of a search, named itself or by its configuration file, or the only one; None if there is a storage only."""
-    from search.execution.storage import STUDY_FILE
+    from sb3_aarl.search.execution.storage import STUDY_FILE
 
     if folder is not None:
         named = run_folder(folder, None)
@@ -97,7 +95,7 @@ def search_folder(folder: Path | None, storage: str | None) -> Path | None:
 
 def open_studies(folders: Sequence[Path | None] | None, storage: str | None) -> "dict[str, tuple[Study, Path]]":
     """Studies and their folders by name; by folder where names are alike."""
-    from search.execution.storage import load_study, open_storage
+    from sb3_aarl.search.execution.storage import load_study, open_storage
 
     found = {}
     for folder in folders or [None]:

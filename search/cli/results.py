@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.markup import escape
-
-from search.cli import options
-from search.cli.console import console, print_wide, records, say, say_json, show_table, time_to_go
-from search.cli.options import Folder, Storage, open_studies, search_folder
+from sb3_aarl.search.cli import options
+from sb3_aarl.search.cli.console import console, print_wide, records, say, say_json, show_table, time_to_go
+from sb3_aarl.search.cli.options import Folder, Storage, open_studies, search_folder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,7 +37,7 @@ def table(
     json: options.Json = False,
 ) -> None:
     """Show a benchmark beside the paper's tables, with interquartile means and probabilities of improvement."""
-    from search.results import table as tables
+    from sb3_aarl.search.results import table as tables
 
     found = tables.read_tables(folder)
     if json:
@@ -53,7 +52,7 @@ def table(
 
 def say_missing(runs: "pd.DataFrame") -> None:
     """Name the runs that a benchmark does not have, and those that should not be compared."""
-    from search.results import table as tables
+    from sb3_aarl.search.results import table as tables
 
     for line in tables.missing(runs) + tables.mixed(runs):
         say(line, style="red")
@@ -67,7 +66,7 @@ def analyze(
     json: options.Json = False,
 ) -> None:
     """Show what searches teach about losses: patterns (table 5), importances, effects, diversity, lineage, metrics."""
-    from search.results import analysis
+    from sb3_aarl.search.results import analysis
 
     patterns = {**analysis.PATTERNS, **{text: text for text in pattern or ()}}
     summaries = {
@@ -107,9 +106,8 @@ def status(
 ) -> None:
     """Show how far a search, what belongs to it, or a benchmark is: runs done, running, failed, best so far, time to go."""
     import pandas as pd
-
-    from search.execution.storage import STUDY_FILE
-    from search.studies.status import PARTS, matrix_status, search_status
+    from sb3_aarl.search.execution.storage import STUDY_FILE
+    from sb3_aarl.search.studies.status import PARTS, matrix_status, search_status
 
     folder = folder or search
     path = search_folder(folder, storage)
@@ -153,8 +151,8 @@ def report(
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
     """Write a report of a search as one HTML file."""
-    from search.execution.matrix import stored_scores
-    from search.results.report import stored_baselines, write_report
+    from sb3_aarl.search.execution.matrix import stored_scores
+    from sb3_aarl.search.results.report import stored_baselines, write_report
 
     ((searched, path),) = open_studies([folder or search], storage).values()
     out = out or path / "report.html"
@@ -174,11 +172,10 @@ def dashboard(
 ) -> None:
     """Watch a search in optuna-dashboard. Everybody who reaches it can change and delete studies."""
     from optuna_dashboard import run_server
-
-    from search.execution.storage import load_study, open_storage
-    from search.results.dashboard import update_plots
-    from search.results.report import stored_baselines
-    from search.studies.search import SETTINGS_KEY
+    from sb3_aarl.search.execution.storage import load_study, open_storage
+    from sb3_aarl.search.results.dashboard import update_plots
+    from sb3_aarl.search.results.report import stored_baselines
+    from sb3_aarl.search.studies.search import SETTINGS_KEY
 
     path = search_folder(folder or search, storage)
     opened = open_storage(path, storage, create=False)
@@ -216,10 +213,10 @@ def figures(
     ] = None,
 ) -> None:
     """Draw a figure of the paper from stored data, as one file."""
-    from search.results import analysis, plots
-    from search.results.report import stored_baselines
-    from search.results.table import read_runs
-    from search.studies.benchmark import read_curves
+    from sb3_aarl.search.results import analysis, plots
+    from sb3_aarl.search.results.report import stored_baselines
+    from sb3_aarl.search.results.table import read_runs
+    from sb3_aarl.search.studies.benchmark import read_curves
 
     if pattern and kind != "patterns":
         raise ValueError("--pattern is for aarl figures patterns")

@@ -6,16 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-
-from search.cli.console import live, say, show_costs, time_to_go
-from search.cli.options import DryRun, Folder, SearchFile, Storage, Threads, read_config, run_folder
+from sb3_aarl.search.cli.console import live, say, show_costs, time_to_go
+from sb3_aarl.search.cli.options import DryRun, Folder, SearchFile, Storage, Threads, read_config, run_folder
 
 if TYPE_CHECKING:
     from optuna import Trial
-
-    from search.execution.driver import SearchProgress
-    from search.studies.config import SearchConfig
-    from search.training.run import Run
+    from sb3_aarl.search.execution.driver import SearchProgress
+    from sb3_aarl.search.studies.config import SearchConfig
+    from sb3_aarl.search.training.run import Run
 
 app = typer.Typer()
 # Seconds between two drawings of the evolution, which holds every candidate.
@@ -55,14 +53,13 @@ def search(
 
     from optuna import get_all_study_names, logging
     from optuna_dashboard import save_note
-
-    from search.execution.driver import Driver
-    from search.execution.runs import LocalExecutor
-    from search.execution.storage import STUDY_FILE, open_storage
-    from search.results.dashboard import HOW_TO_READ, annotate_trial, update_plots
-    from search.results.report import stored_baselines
-    from search.studies.search import open_search, runs_of
-    from search.training.provenance import hide_password
+    from sb3_aarl.search.execution.driver import Driver
+    from sb3_aarl.search.execution.runs import LocalExecutor
+    from sb3_aarl.search.execution.storage import STUDY_FILE, open_storage
+    from sb3_aarl.search.results.dashboard import HOW_TO_READ, annotate_trial, update_plots
+    from sb3_aarl.search.results.report import stored_baselines
+    from sb3_aarl.search.studies.search import open_search, runs_of
+    from sb3_aarl.search.training.provenance import hide_password
 
     logging.set_verbosity(logging.WARNING)
     settings = read_config(config, threads=threads, generations=generations, pruner=pruner)
@@ -82,7 +79,7 @@ def search(
     say(f"Study {settings.name}. To watch it: aarl dashboard {path}{options}")
     running: Any
     if executor == "ray":
-        from search.execution.ray import RayExecutor
+        from sb3_aarl.search.execution.ray import RayExecutor
 
         running = RayExecutor(ray_address, 1 if cpus_per_run is None else cpus_per_run, gpus_per_run or 0)
     else:
@@ -113,9 +110,9 @@ def search(
 
 def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
     """All runs of a search's file by kind: candidates, baselines, cross-validation."""
-    from search.execution.matrix import task_name
-    from search.studies import cross_validation
-    from search.studies.search import all_runs, baselines
+    from sb3_aarl.search.execution.matrix import task_name
+    from sb3_aarl.search.studies import cross_validation
+    from sb3_aarl.search.studies.search import all_runs, baselines
 
     kinds = {config.name: all_runs(config)}
     for cell, run in baselines(config, Path()).runs.items():

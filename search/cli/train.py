@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 from rich.table import Table
-
-from search.cli.console import console, errors, print_wide, say, say_json, time_to_go
-from search.cli.options import SHIPPED, Imports, Json, Model, modules
-from search.training.shipped import find_file
+from sb3_aarl.search.cli.console import console, errors, print_wide, say, say_json, time_to_go
+from sb3_aarl.search.cli.options import SHIPPED, Imports, Json, Model, modules
+from sb3_aarl.search.training.shipped import find_file
 
 if TYPE_CHECKING:
     from sb3_aarl.callbacks import Evaluation
@@ -43,10 +42,11 @@ def train(
     json: Json = False,
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
+    from sb3_aarl.search.studies.single import prepare_one
+    from sb3_aarl.search.training.run import is_finished, read_run
+    from sb3_aarl.search.training.run import train as train_run
+
     from sb3_aarl.callbacks import aulc
-    from search.studies.single import prepare_one
-    from search.training.run import is_finished, read_run
-    from search.training.run import train as train_run
 
     def show(curve: "list[Evaluation]") -> None:
         point = curve[-1]
@@ -99,7 +99,7 @@ def configs(
     every: Annotated[bool, typer.Option("--all", help="Those of the experiments in results/ too.")] = False, json: Json = False
 ) -> None:
     """List the configurations that come with the package, for commands that take a file."""
-    from search.training.shipped import shipped_files
+    from sb3_aarl.search.training.shipped import shipped_files
 
     kinds = {"Hyper-parameters: aarl train --config NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
     found = {
@@ -175,9 +175,8 @@ def video(
 
 def play(model: Path, env: str | None, episodes: int, seed: int, imports: str, frames: list[Any] | None = None) -> list[float]:
     """The returns of a model's episodes, and, where wanted, their pictures."""
+    from sb3_aarl.search.studies.single import load_trained
     from stable_baselines3.common.evaluation import evaluate_policy
-
-    from search.studies.single import load_trained
 
     trained, environment = load_trained(model, env, frames is not None, modules(imports))
     environment.seed(seed)

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from sb3_aarl.search.evolution import mutations, space
+from sb3_aarl.search.evolution.surrogate import TokenModel
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution import mutations, space
-from search.evolution.surrogate import TokenModel
 
 if TYPE_CHECKING:
-    from search.evolution.sampler import AuxLossSampler
+    from sb3_aarl.search.evolution.sampler import AuxLossSampler
 
 logger = logging.getLogger(__name__)
 

@@ -6,9 +6,9 @@ not valid, and is to be redrawn.
 from collections.abc import Sequence
 
 import numpy as np
+from sb3_aarl.search.evolution.space import MAX_HORIZON, random_operator
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution.space import MAX_HORIZON, random_operator
 
 
 def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str] | None = None) -> AuxLoss:

@@ -15,10 +15,10 @@ from optuna.distributions import BaseDistribution
 from optuna.samplers import BaseSampler, RandomSampler
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
+from sb3_aarl.search.evolution import space
+from sb3_aarl.search.evolution.candidates import Candidates, Result
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution import space
-from search.evolution.candidates import Candidates, Result
 
 logger = logging.getLogger(__name__)
 

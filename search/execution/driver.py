@@ -14,15 +14,15 @@ from filelock import FileLock, Timeout
 from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState
+from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
+from sb3_aarl.search.evolution.space import loss_of, suggest_aux_loss
+from sb3_aarl.search.execution.runs import Executor, RunFailed, Submission, mean_curve
+from sb3_aarl.search.training.provenance import commit, read_about, versions
+from sb3_aarl.search.training.run import Run, partial_curve
 from tenacity import Retrying, before_sleep_log, retry_if_exception_type, stop_after_delay, wait_random_exponential
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import aulc
-from search.evolution.sampler import AuxLossSampler, GenerationProgress
-from search.evolution.space import loss_of, suggest_aux_loss
-from search.execution.runs import Executor, RunFailed, Submission, mean_curve
-from search.training.provenance import commit, read_about, versions
-from search.training.run import Run, partial_curve
 
 logger = logging.getLogger(__name__)
 

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
+from sb3_aarl.search.execution.runs import Executor, Submission
+from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
+from sb3_aarl.search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run
 
 from sb3_aarl.callbacks import Evaluation, aulc, replace_text
 from sb3_aarl.envs import PREFIX
-from search.execution.runs import Executor, Submission
-from search.training.provenance import ABOUT, read_about, write_about
-from search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run
 
 POLL_SECONDS = 0.5
 

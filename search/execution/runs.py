@@ -11,10 +11,20 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from sb3_aarl.search.training.provenance import provenance, read_about, write_about
+from sb3_aarl.search.training.run import (
+    LOCKED,
+    STOP,
+    Outcome,
+    Run,
+    is_finished,
+    partial_curve,
+    prepare_run,
+    read_outcome,
+    read_run,
+)
 
 from sb3_aarl.callbacks import Evaluation
-from search.training.provenance import provenance, read_about, write_about
-from search.training.run import LOCKED, STOP, Outcome, Run, is_finished, partial_curve, prepare_run, read_outcome, read_run
 
 logger = logging.getLogger(__name__)
 
@@ -62,9 +72,8 @@ def start_run(folder: str) -> dict[str, Any]:
 def _train(folder: Path) -> int:
     """Train a run in a process, whose exit code is returned."""
     threads = read_run(folder).threads
-    command = [sys.executable, "-m", "search.training.run", str(folder), "--end-with-stdin"]
-    # A user's own search.py in the working directory is not the package.
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "PYTHONSAFEPATH": "1"}
+    command = [sys.executable, "-m", "sb3_aarl.search.training.run", str(folder), "--end-with-stdin"]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     # A session of its own: Ctrl-C reaches the driver only, whose end closes the pipe.
     with (
         (folder / OUTPUT).open("ab") as output,

@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
+from sb3_aarl.search.evolution.space import loss_of, loss_to_params
 from scipy.spatial.distance import pdist
 from scipy.stats import ttest_ind
 from sklearn.ensemble import RandomForestRegressor
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
-from search.evolution.space import loss_of, loss_to_params
 
 # Section 3.3, in the order of table 5.
 PATTERNS: Mapping[str, str | AuxLoss] = {

@@ -4,9 +4,8 @@ from collections.abc import Iterable
 
 from optuna import Study, Trial
 from optuna_dashboard import save_note, save_plotly_graph_object
-
-from search.results.analysis import trial_table
-from search.results.plots import evolution_figure
+from sb3_aarl.search.results.analysis import trial_table
+from sb3_aarl.search.results.plots import evolution_figure
 
 PLOT_ID = "evolution"
 # Notes are attributes of the study, of which every page of the dashboard reads all.

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from optuna.study import StudyDirection
+from sb3_aarl.search.results import analysis
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.results import analysis
 
 # Lines differ by dash, not by colour alone: they have to be told apart in grey.
 DASHES = ("dash", "dot", "dashdot", "longdash", "longdashdot")

@@ -12,14 +12,14 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from optuna import Study
+from sb3_aarl.search.execution.matrix import comparable, stored_scores, task_name
+from sb3_aarl.search.results import analysis
+from sb3_aarl.search.results.plots import evolution_plot, patterns_plot, rankings_plot
+from sb3_aarl.search.studies import cross_validation
+from sb3_aarl.search.studies.search import SETTINGS_KEY
+from sb3_aarl.search.training.provenance import provenance
 
 from sb3_aarl.callbacks import replace_text
-from search.execution.matrix import comparable, stored_scores, task_name
-from search.results import analysis
-from search.results.plots import evolution_plot, patterns_plot, rankings_plot
-from search.studies import cross_validation
-from search.studies.search import SETTINGS_KEY
-from search.training.provenance import provenance
 
 N_BEST = 10
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from sb3_aarl.search.execution.matrix import task_name
 from scipy import stats
 
 from sb3_aarl.envs import PREFIX
-from search.execution.matrix import task_name
 
 # Resamples of the bootstrap.
 RESAMPLES = 9999

@@ -12,13 +12,13 @@ import pandas as pd
 import yaml
 from rich.markup import escape
 from rich.table import Table
+from sb3_aarl.search.execution.matrix import comparable, task_name
+from sb3_aarl.search.results.statistics import SUITE, improvements, interquartile_means
+from sb3_aarl.search.studies import operator_selection
+from sb3_aarl.search.studies.benchmark import read_abouts
+from sb3_aarl.search.training.run import FAILED, partial_curve
 
 from sb3_aarl.envs import PREFIX
-from search.execution.matrix import comparable, task_name
-from search.results.statistics import SUITE, improvements, interquartile_means
-from search.studies import operator_selection
-from search.studies.benchmark import read_abouts
-from search.training.run import FAILED, partial_curve
 
 # A difference is marked from so many standard errors on.
 STANDARD_ERRORS = 2.0
@@ -109,8 +109,8 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     means, 2 sqrt(s^2 / n + S^2 / N), with s and n of the runs here, S and N of the paper's table; the paper does not say
     which deviation it prints. With one run here there is no s, and no mark.
 
-    For table 6 the returns are normalized as for table 2, see :func:`search.studies.operator_selection.table`, over the
-    variants that are complete: if these are not the paper's four, no number of the paper stands beside them. N is 5 seeds x
+    For table 6 the returns are normalized as for table 2, see
+    :func:`sb3_aarl.search.studies.operator_selection.table`, over the variants that are complete: if these are not the paper's four, no number of the paper stands beside them. N is 5 seeds x
     6 environments there, so both deviations contain the difference of the environments: the test is a cautious one.
     """
     keys = ["checkpoint", "environment", "variant"]

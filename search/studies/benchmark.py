@@ -9,13 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from sb3_aarl.search.execution.matrix import Cell, Matrix, task_name
+from sb3_aarl.search.training.config import (
+    ConfigError,
+    action_repeat,
+    import_modules,
+    load_hyperparameters,
+    read_yaml,
+    resolve_env_id,
+)
+from sb3_aarl.search.training.provenance import ABOUT, read_about
+from sb3_aarl.search.training.run import FREE, Run, check_checkpoints, check_run, differences, partial_curve
 
 from sb3_aarl import catalog
 from sb3_aarl.envs import PREFIX
-from search.execution.matrix import Cell, Matrix, task_name
-from search.training.config import ConfigError, action_repeat, import_modules, load_hyperparameters, read_yaml, resolve_env_id
-from search.training.provenance import ABOUT, read_about
-from search.training.run import FREE, Run, check_checkpoints, check_run, differences, partial_curve
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)

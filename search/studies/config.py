@@ -15,15 +15,15 @@ from pydantic import (
     ValidationInfo,
     field_validator,
 )
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import MAX_HORIZON, loss_to_params
+from sb3_aarl.search.training import config as training
+from sb3_aarl.search.training.config import ConfigError
+from sb3_aarl.search.training.run import check_checkpoints
+from sb3_aarl.search.training.shipped import find_file
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import LONGEST_HORIZON, AuxLoss
-from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import MAX_HORIZON, loss_to_params
-from search.training import config as training
-from search.training.config import ConfigError
-from search.training.run import check_checkpoints
-from search.training.shipped import find_file
 
 
 def _ascending(steps: tuple[int, ...]) -> tuple[int, ...]:

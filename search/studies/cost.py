@@ -6,10 +6,10 @@ from contextlib import closing
 
 import pandas as pd
 import torch as th
+from sb3_aarl.search.training.run import Run, Setup
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_aarl.buffers import ARRAYS, WindowReplayBuffer
-from search.training.run import Run, Setup
 
 MEASURED_SECONDS = 2.0
 MEASURED_STEPS = 50  # at least, so that there are windows

@@ -9,17 +9,17 @@ import optuna
 import pandas as pd
 import yaml
 from optuna.study import StudyDirection
+from sb3_aarl.search.evolution.surrogate import TokenModel
+from sb3_aarl.search.execution.matrix import Cell, Matrix
+from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
+from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
+from sb3_aarl.search.studies.search import make_run
+from sb3_aarl.search.training.config import ConfigError
+from sb3_aarl.search.training.run import Run
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import replace_text
-from search.evolution.surrogate import TokenModel
-from search.execution.matrix import Cell, Matrix
-from search.results.analysis import analysed, ranked, trial_table
-from search.studies.config import Baseline, CrossValidation, SearchConfig
-from search.studies.search import make_run
-from search.training.config import ConfigError
-from search.training.run import Run
 
 logger = logging.getLogger(__name__)
 

@@ -5,13 +5,13 @@ from itertools import product
 from pathlib import Path
 
 import pandas as pd
+from sb3_aarl.search.execution.matrix import Cell, Matrix
+from sb3_aarl.search.studies.config import SearchConfig
+from sb3_aarl.search.studies.search import make_run
+from sb3_aarl.search.training.config import ConfigError
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import OPERATORS
-from search.execution.matrix import Cell, Matrix
-from search.studies.config import SearchConfig
-from search.studies.search import make_run
-from search.training.config import ConfigError
 
 NEGATIVES = {True: "w/ negative samples", False: "w/o negative samples"}
 

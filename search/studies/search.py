@@ -11,12 +11,12 @@ from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import TrialState
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.execution.matrix import Cell, Matrix
+from sb3_aarl.search.studies.config import Baseline, SearchConfig
+from sb3_aarl.search.training.run import FREE, Run, differences
 
 from sb3_aarl.aux_loss import AuxLoss
-from search.evolution.sampler import AuxLossSampler
-from search.execution.matrix import Cell, Matrix
-from search.studies.config import Baseline, SearchConfig
-from search.training.run import FREE, Run, differences
 
 SETTINGS_KEY = "settings"  # user attribute of a study
 # Settings that may change when a search is resumed, beside those of its runs.

@@ -5,13 +5,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
-
-from sb3_aarl import SACAux, catalog
-from sb3_aarl.envs import PREFIX
-from search.training.config import ConfigError, action_repeat, import_modules, load_hyperparameters, resolve_env_id
-from search.training.run import (
+from sb3_aarl.search.training.config import ConfigError, action_repeat, import_modules, load_hyperparameters, resolve_env_id
+from sb3_aarl.search.training.run import (
     MODEL,
     NORMALIZE,
     RUN,
@@ -23,7 +18,12 @@ from search.training.run import (
     read_run,
     spread_checkpoints,
 )
-from search.training.shipped import find_file
+from sb3_aarl.search.training.shipped import find_file
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_aarl import SACAux, catalog
+from sb3_aarl.envs import PREFIX
 
 VIDEO_SIZE = 320  # pixels, height and width
 
@@ -41,7 +41,7 @@ def prepare_one(
     imports: Sequence[str] = (),
 ) -> Path:
     """
-    Prepare the folder of a run with one loss, which keeps its model, for :func:`search.training.run.train`, and return it.
+    Prepare the folder of a run with one loss, which keeps its model, for ``training.run.train``, and return it.
     ``aux_loss=None`` is that of the file of hyper-parameters, or ``"auto"``; ``"none"`` is none.
     """
     import_modules(imports)
@@ -76,7 +76,7 @@ def prepare_one(
         label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {named or 'none'}".lower())[:80].strip("-")
         folder = Path("runs") / f"{label}-{hashlib.sha256(run.model_dump_json().encode()).hexdigest()[:8]}-seed-{seed}"
     folder = Path(folder)
-    if (folder / "study.db").exists():  # search.execution.storage, which has the name, needs Optuna
+    if (folder / "study.db").exists():  # sb3_aarl.search.execution.storage, which has the name, needs Optuna
         raise ValueError(f"{folder} is the folder of a search: choose another folder (--folder)")
     check_run(run)
     prepare_run(folder, run)

@@ -7,15 +7,15 @@ from pathlib import Path
 import optuna
 import pandas as pd
 from filelock import FileLock, Timeout
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.execution import driver
+from sb3_aarl.search.execution.matrix import share_left
+from sb3_aarl.search.studies.search import SETTINGS_KEY
+from sb3_aarl.search.training.provenance import read_about
+from sb3_aarl.search.training.run import LOCK, RUN, partial_curve, read_outcome, read_run
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import aulc
-from search.evolution.sampler import AuxLossSampler
-from search.execution import driver
-from search.execution.matrix import share_left
-from search.studies.search import SETTINGS_KEY
-from search.training.provenance import read_about
-from search.training.run import LOCK, RUN, partial_curve, read_outcome, read_run
 
 # Folders of matrices in that of a search.
 PARTS = ("baselines", "cross-validation", "operators")

@@ -72,7 +72,7 @@ def hide_password(text: str) -> str:
 def provenance() -> dict[str, str]:
     """Commit, command, date, hardware and versions: they belong beside every result."""
     name = Path(sys.argv[0]).name
-    command = shlex.join(["aarl" if name == "main.py" else name, *sys.argv[1:]])  # main.py: python -m search.cli.main
+    command = shlex.join(["aarl" if name == "main.py" else name, *sys.argv[1:]])  # main.py: python -m sb3_aarl.search.cli.main
     return {
         "commit": commit(),
         "command": hide_password(command),

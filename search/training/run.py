@@ -21,16 +21,8 @@ import pydantic
 import torch as th
 from filelock import FileLock, Timeout
 from gymnasium import spaces
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
-
-from sb3_aarl import AuxLoss, SACAux
-from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, read_curve, replace_text, write_curve
-from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
-from search.training import checkpoint
-from search.training.config import (
+from sb3_aarl.search.training import checkpoint
+from sb3_aarl.search.training.config import (
     VEC_ENVS,
     ConfigError,
     action_repeat,
@@ -39,7 +31,15 @@ from search.training.config import (
     import_modules,
     validated,
 )
-from search.training.provenance import add_session, read_about, write_about
+from sb3_aarl.search.training.provenance import add_session, read_about, write_about
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+from sb3_aarl import AuxLoss, SACAux
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, read_curve, replace_text, write_curve
+from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
 
 logger = logging.getLogger(__name__)
 

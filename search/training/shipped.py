@@ -1,9 +1,10 @@
 """The files of ``zoo_configs/`` by name."""
 
 import difflib
+from importlib.resources import files
 from pathlib import Path
 
-ZOO = Path(__file__).parents[2] / "zoo_configs"
+ZOO = Path(str(files("sb3_aarl.zoo_configs")))
 SEARCHES = ZOO / "search"
 
 

@@ -1,4 +1,4 @@
-from search.evolution.sampler import AuxLossSampler
-from search.evolution.space import suggest_aux_loss
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import suggest_aux_loss
 
 __all__ = ["AuxLossSampler", "suggest_aux_loss"]
