@@ -110,8 +110,9 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     which deviation it prints. With one run here there is no s, and no mark.
 
     For table 6 the returns are normalized as for table 2, see
-    :func:`sb3_aarl.search.studies.operator_selection.table`, over the variants that are complete: if these are not the paper's four, no number of the paper stands beside them. N is 5 seeds x
-    6 environments there, so both deviations contain the difference of the environments: the test is a cautious one.
+    :func:`sb3_aarl.search.studies.operator_selection.table`, over the variants that are complete: if these are not the
+    paper's four, no number of the paper stands beside them. N is 5 seeds x 6 environments there, so both deviations
+    contain the difference of the environments: the test is a cautious one.
     """
     keys = ["checkpoint", "environment", "variant"]
     numbers = ["paper_mean", "paper_std", "paper_runs"]
