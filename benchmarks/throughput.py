@@ -39,7 +39,7 @@ def rate(setting: str, device: str, mode: str, threads: int, seconds: float) -> 
     """One process: gradient steps a second while all others train too."""
     try:
         th.set_num_threads(threads)
-        model = ours(setting, device, **modes("pixels")[mode])
+        model = ours(setting, device, **modes("pixels", ["", ", compiled"])[mode])
         model.set_logger(configure(None, []))
         fill(model, 2000)
         model.train(10 if device == "cuda" else 2, BATCH[setting])
@@ -79,7 +79,8 @@ def main() -> None:
     device = "cuda" if th.cuda.is_available() else "cpu"
     parser.add_argument("--settings", nargs="+", default=["state"], choices=["state", "small", "pixels"])
     parser.add_argument("--device", default=device, choices=["cpu", "cuda"])
-    parser.add_argument("--modes", nargs="+", default=list(modes("pixels")), choices=list(modes("pixels")))
+    names = list(modes("pixels", ["", ", compiled"]))
+    parser.add_argument("--modes", nargs="+", default=names, choices=names)
     parser.add_argument("--processes", nargs="+", type=int, default=[1, 2] if device == "cpu" else [1, 2, 4, 8, 16])
     parser.add_argument("--cores", type=int, default=th.get_num_threads(), help="shared out among the processes as threads")
     parser.add_argument("--seconds", type=float, default=10)

@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gymnasium as gym
 import numpy as np
@@ -37,14 +38,17 @@ from torch.utils.flop_counter import FlopCounterMode
 from sb3_aarl import SACAux
 from sb3_aarl.encoders import PixelEncoder
 
+torch_compile = th.compile
 ACTION_DIM = 6
 STATE_DIM = 17
 EPISODE = 250
-BATCH = {"state": 512, "small": 256, "pixels": 128}
-WIDTH = {"state": 1024, "small": 256, "pixels": 1024}
-STEPS = {"state": 6, "small": 40, "pixels": 2}
+BATCH = {"state": 512, "small": 256, "pixels": 128, "pixels-512": 512}
+WIDTH = {"state": 1024, "small": 256, "pixels": 1024, "pixels-512": 1024}
+STEPS = {"state": 6, "small": 40, "pixels": 2, "pixels-512": 1}
 REFERENCE_MS, REFERENCE_GFLOPS = {"state": 107, "pixels": 1139}, 220
-TRANSITIONS = {"state": 20_000, "small": 20_000, "pixels": 2000}
+TRANSITIONS = {"state": 20_000, "small": 20_000, "pixels": 2000, "pixels-512": 2000}
+# How the losses of a row whose name ends so are compiled; SACAux's own way is the first.
+COMPILED: dict[str, dict[str, Any]] = {", compiled": {}, ", CUDA graphs": {"triton.cudagraphs": True}}
 DENSE_MLP: dict[str, Any] = {"policy_kwargs": {"features_extractor_class": "dense_mlp"}}
 PARTS = ("sampling", "critic", "actor", "auxiliary", "targets")
 
@@ -54,7 +58,7 @@ class RandomEnv(gym.Env):
 
     def __init__(self, setting: str, size: int):
         self.action_space = spaces.Box(-1, 1, (ACTION_DIM,), np.float32)
-        if setting != "pixels":
+        if not setting.startswith("pixels"):
             self.observation_space = spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)
         else:
             self.observation_space = spaces.Box(0, 255, (9, size, size), np.uint8)
@@ -89,10 +93,10 @@ def fill(model: SAC, transitions: int) -> None:
 
 def sb3(setting: str, device: str) -> SAC:
     kwargs: dict[str, Any] = {"net_arch": [WIDTH[setting]] * 2}
-    if setting == "pixels":
+    if setting.startswith("pixels"):
         # SB3's own way: one encoder for actor and one for critic, no augmentation, images of the size that convolutions see.
         kwargs["features_extractor_class"] = PixelEncoder
-    policy = "CnnPolicy" if setting == "pixels" else "MlpPolicy"
+    policy = "CnnPolicy" if setting.startswith("pixels") else "MlpPolicy"
     return SAC(
         policy,
         RandomEnv(setting, 84),
@@ -104,8 +108,8 @@ def sb3(setting: str, device: str) -> SAC:
 
 
 def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
-    policy = "CnnPolicy" if setting == "pixels" else "MlpPolicy"
-    if setting == "pixels":
+    policy = "CnnPolicy" if setting.startswith("pixels") else "MlpPolicy"
+    if setting.startswith("pixels"):
         kwargs["replay_buffer_kwargs"] = {"frame_stack": 3, **kwargs.get("replay_buffer_kwargs", {})}
     kwargs["policy_kwargs"] = {"net_arch": [WIDTH[setting]] * 2, **kwargs.get("policy_kwargs", {})}
     return SACAux(
@@ -113,16 +117,21 @@ def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
     )
 
 
-def modes(setting: str) -> dict[str, dict[str, Any]]:
-    """The ways to run a gradient step, by name."""
-    encoder, loss = ({}, "aarl-pixel") if setting == "pixels" else (DENSE_MLP, "aarl-state")
-    precisions: dict[str, dict[str, Any]] = {"fp32": {}, "bf16": {"precision": "bf16"}}
-    precisions |= {f"{name}, compiled": {**kwargs, "compile": True} for name, kwargs in precisions.items()}
-    ways: dict[str, dict[str, Any]] = {"no auxiliary loss": {**encoder, "aux_loss": None}}
-    ways |= {name: {**kwargs, **encoder, "aux_loss": loss} for name, kwargs in precisions.items()}
-    if setting == "small":
-        ways |= {"simba, no auxiliary loss": {"aux_loss": None}, "simba, AARL-State": {"aux_loss": "aarl-state"}}
-        ways |= {f"simba, {name}": kwargs for name, kwargs in precisions.items()}
+def modes(setting: str, compiled: list[str]) -> dict[str, dict[str, Any]]:
+    """The ways to run a gradient step, by name; ``compiled``: endings of ``COMPILED``, and ``""`` for those that are not."""
+    encoder, loss = ({}, "aarl-pixel") if setting.startswith("pixels") else (DENSE_MLP, "aarl-state")
+    ways: dict[str, dict[str, Any]] = {}
+    for ending in compiled:
+        for precision in ("fp32", "bf16"):
+            kwargs = {"precision": precision, "compile": bool(ending)}
+            ways[f"{precision}{ending}"] = {**kwargs, **encoder, "aux_loss": loss}
+            if setting == "small":
+                ways[f"simba, {precision}{ending}"] = kwargs
+                ways[f"simba, n_steps=3, {precision}{ending}"] = {**kwargs, "n_steps": 3}
+    if "" in compiled:
+        ways["no auxiliary loss"] = {**encoder, "aux_loss": None}
+        if setting == "small":
+            ways |= {"simba, no auxiliary loss": {"aux_loss": None}, "simba, AARL-State": {"aux_loss": "aarl-state"}}
     return ways
 
 
@@ -199,15 +208,32 @@ def parts(model: SACAux, device: str, steps: int) -> dict[str, float]:
     return {part: 1e3 * value / steps for part, value in seconds.items()}
 
 
+def compiling(name: str) -> Any:
+    """While a model is made: SACAux compiles its losses as the name of its row says."""
+    options = next((options for ending, options in COMPILED.items() if name.endswith(ending)), {})
+
+    def compile_losses(function: Callable, **_: Any) -> Callable:
+        return torch_compile(function, options={"fallback_random": True, **options})
+
+    return mock.patch.object(th, "compile", compile_losses)
+
+
 def measure(
     setting: str, device: str, variants: dict[str, dict[str, Any]], rounds: int, steps: int, at_once: int = 1
 ) -> list[dict[str, Any]]:
-    models: dict[str, SAC] = {"SB3 SAC": sb3(setting, device)}
-    models |= {name: ours(setting, device, **kwargs) for name, kwargs in variants.items()}
-    for model in models.values():
+    models: dict[str, SAC] = {}
+    memory: dict[str, float] = {}
+    for name in ("SB3 SAC", *variants):
+        before = th.cuda.memory_allocated() if device == "cuda" else 0
+        with compiling(name):
+            model = models[name] = sb3(setting, device) if name == "SB3 SAC" else ours(setting, device, **variants[name])
         model.set_logger(configure(None, []))
         fill(model, TRANSITIONS[setting])
+        if device == "cuda":
+            th.cuda.reset_peak_memory_stats()
         model.train(8, model.batch_size)  # allocates, warms up, compiles
+        if device == "cuda":
+            memory[name] = (th.cuda.max_memory_allocated() - before) / 1e6
     seconds: dict[str, list[float]] = {name: [] for name in models}
     for _ in range(rounds):
         for name, model in models.items():
@@ -225,6 +251,8 @@ def measure(
             "setting": setting,
             "algorithm": name,
             "ms": 1e3 * statistics.median(seconds[name]),
+            "steps_per_second": 1 / statistics.median(seconds[name]),
+            "memory_mb": memory.get(name),
             "ratio": statistics.median(own / base for own, base in zip(seconds[name], seconds["SB3 SAC"], strict=True)),
             "rounds_ms": [1e3 * value for value in seconds[name]],
             "gflop": flops(model) / 1e9,
@@ -269,6 +297,8 @@ def main() -> None:
     parser.add_argument(
         "--at-once", type=int, default=1, help="gradient steps in a call of train(); learn() makes one in each"
     )
+    ways = {"no": [""], "all": ["", ", compiled"], "only": [", compiled"], "graphs": [", CUDA graphs"]}
+    parser.add_argument("--compiled", choices=list(ways), default="all", help="by SACAux, or with CUDA graphs too")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
@@ -276,10 +306,10 @@ def main() -> None:
     for setting in args.settings:
         th.set_num_threads(1 if setting == "small" else threads)
         steps = args.steps or (200 if args.device == "cuda" else STEPS[setting])
-        rows += measure(setting, args.device, modes(setting), args.rounds, steps, args.at_once)
+        rows += measure(setting, args.device, modes(setting, ways[args.compiled]), args.rounds, steps, args.at_once)
         show(rows)
-    if args.out:
-        save_result(args.out, threads=threads, rows=rows)
+        if args.out:  # after each setting: what comes later may be cut off
+            save_result(args.out, threads=threads, rows=rows)
 
 
 if __name__ == "__main__":
