@@ -2,13 +2,12 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -28,6 +27,12 @@ __all__ = ["NoWindowError", "WindowReplayBuffer", "WindowSamples", "detect_frame
 MAX_REDRAWS = 8
 # What is stored of each transition beside its frames.
 ARRAYS = ("actions", "rewards", "dones", "timeouts", "ages", "ended")
+STACK_ADVICE = (
+    "The stack has to be the outermost observation wrapper, along the channels, oldest frame first: action repeat, rendering "
+    "and resizing inside, FrameStackObservation or VecFrameStack outside. If observations are no stacks, pass "
+    "replay_buffer_kwargs=dict(frame_stack=1). If the environments were stepped outside of learn(), or the buffer was emptied "
+    "inside an episode, model.set_env(model.get_env()) has learn() reset them"
+)
 
 
 class WindowSamples(NamedTuple):
@@ -55,29 +60,7 @@ def map_parts(function: Callable[[Any], Any], observations: Any) -> Any:
     return function(observations)
 
 
-@dataclass
-class _Observations:
-    """SB3's array (buffer_size, n_envs, ...) of observations of one key, or of the next ones, as its own code reads it."""
-
-    buffer: "WindowReplayBuffer"
-    key: str
-    following: bool
-
-    def __getitem__(self, index: Any) -> np.ndarray:
-        index = index if isinstance(index, tuple) else (index,)
-        if any(part is Ellipsis or part is None for part in index):
-            return self[:][index]
-        grid = np.broadcast_arrays(*np.ogrid[: self.buffer.buffer_size, : self.buffer.n_envs])
-        positions, envs = (np.asarray(part[index[:2]]) for part in grid)
-        observations = self.buffer.gather(positions * self.buffer.n_envs + envs, self.following)
-        part = observations[self.key] if isinstance(observations, dict) else observations
-        return part.numpy()[(*(slice(None),) * positions.ndim, *index[2:])]
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self[:], dtype)
-
-
-class WindowReplayBuffer(NStepReplayBuffer):
+class WindowReplayBuffer(ReplayBuffer):
     """
     SB3's replay buffer (n-step returns included) that also draws windows, and stores each frame once.
 
@@ -92,7 +75,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
     :param n_envs: Number of parallel environments
     :param optimize_memory_usage: Accepted for SB3; frames are stored once anyway
     :param handle_timeout_termination: Whether to bootstrap where an episode was truncated
-    :param n_steps: Number of steps of n-step returns in ``sample``; only 1 for Dict observations, as in SB3
+    :param n_steps: Number of steps of n-step returns in ``sample``
     :param gamma: Discount of n-step returns
     :param frame_stack: How many frames the environment stacks along the first axis of an observation, oldest first
         (channels of images, which SB3 puts first); one number, or one for each key of a Dict. At an episode's start
@@ -100,8 +83,11 @@ class WindowReplayBuffer(NStepReplayBuffer):
     """
 
     # Height and width in pixels that images are cropped to at random while their frames are gathered, each observation at a
-    # position of its own, also one that a window has twice; None for no crop, as always for n-step returns.
+    # position of its own, also one that a window has twice; None for no crop.
     crop_size: int | None = None
+    # Whether ``frame_stack`` is only what the wrappers suggest: where it does not hold, ``add`` warns and stores whole
+    # observations from then on, instead of raising an error.
+    frame_stack_detected = False
 
     def __init__(
         self,
@@ -116,8 +102,6 @@ class WindowReplayBuffer(NStepReplayBuffer):
         gamma: float = 0.99,
         frame_stack: int | Mapping[str, int] = 1,
     ):
-        if n_steps > 1 and isinstance(observation_space, spaces.Dict):
-            raise ValueError(f"n_steps={n_steps}: SB3 has no n-step returns for Dict observations")
         # SB3's ReplayBuffer would allocate its two arrays of observations.
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs)
         self.buffer_size = max(buffer_size // n_envs, 1)
@@ -153,12 +137,13 @@ class WindowReplayBuffer(NStepReplayBuffer):
     def reset(self) -> None:
         """Forget everything."""
         self._count(0)
+        self.ended.fill(False)
         self._last_next_obs: dict[str, np.ndarray] = {}
         self._episode_over = np.ones(self.n_envs, bool)
 
     @property
     def observations(self) -> Any:  # type: ignore[override]
-        """What SB3's buffer has under this name: array-like (buffer_size, n_envs, ...), a dict of them for Dict spaces."""
+        """All that is stored as SB3's array (buffer_size, n_envs, ...), a dict of them for Dict spaces: a read-only copy."""
         return self._as_sb3(following=False)
 
     @property
@@ -167,8 +152,13 @@ class WindowReplayBuffer(NStepReplayBuffer):
         return self._as_sb3(following=True)
 
     def _as_sb3(self, following: bool) -> Any:
-        views = {key: _Observations(self, key, following) for key in self.stores}
-        return views if isinstance(self.observation_space, spaces.Dict) else views[""]
+        def read_only(part: th.Tensor) -> np.ndarray:
+            array = part.numpy()
+            array[self.size() :] = 0
+            array.flags.writeable = False
+            return array
+
+        return map_parts(read_only, self.gather(np.arange(self.ages.size).reshape(self.ages.shape), following))
 
     def gather(
         self,
@@ -181,18 +171,33 @@ class WindowReplayBuffer(NStepReplayBuffer):
         Observations (..., *shape) at flat indices in (buffer_size, n_envs), or the next ones where ``following`` is true;
         (...) is what both broadcast to. With VecNormalize, which normalizes whole images, none is cropped.
         """
-        positions = indices // self.n_envs
-        # Positions before self.pos were written in this round of the ring, the others in the round before.
-        numbers = self.n_added - self.pos + positions - np.where(positions < self.pos, 0, self.buffer_size)
-        ages, final = self.ages.take(indices) + following, self.ended.take(indices) & following
+        located = self._locate(indices, following)
         crops = dict.fromkeys(self._image_keys, crop_size) if env is None else {}
-        parts = {
-            key: store.gather(indices, numbers + following, ages, final, crops.get(key)) for key, store in self.stores.items()
-        }
+        parts = {key: store.gather(indices, *located, crops.get(key)) for key, store in self.stores.items()}
         observations: Any = parts if isinstance(self.observation_space, spaces.Dict) else parts[""]
         if env is not None:
             observations = env.normalize_obs(map_parts(lambda part: part.numpy(), observations))
         return map_parts(th.as_tensor, observations)
+
+    def _locate(self, indices: np.ndarray, following: bool | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where a store has the observations of ``gather``: the arguments of its own ``gather`` after the indices."""
+        positions = indices // self.n_envs
+        # Positions before self.pos were written in this round of the ring, the others in the round before.
+        numbers = self.n_added - self.pos + positions - np.where(positions < self.pos, 0, self.buffer_size)
+        return numbers + following, self.ages.take(indices) + following, self.ended.take(indices) & following
+
+    def _store_whole(self, key: str) -> None:
+        """Store whole observations of this key from now on, also those of the transitions so far."""
+        old = self.stores[key]
+        new = self.stores[key] = FrameStore(key, self.buffer_size, self.n_envs, old.shape, old.frames.dtype, 1)
+        numbers = np.arange(self.n_added - self.size(), self.n_added)
+        for some in np.array_split(numbers, 1 + len(numbers) // 100):
+            indices = some[:, None] % self.buffer_size * self.n_envs + np.arange(self.n_envs)
+            for following in (True, False):  # an episode's first observation replaces the last one of the episode before
+                new.frames[(some + following) % len(new.frames)] = old.gather(indices, *self._locate(indices, following))
+        ended = np.array(list(old.final_frames), np.int64)
+        final = old.gather(ended, *self._locate(ended, True)).numpy()
+        new.final_frames = {index: frame.copy() for index, frame in zip(old.final_frames, final, strict=True)}
 
     def add(  # type: ignore[override]
         self,
@@ -206,7 +211,7 @@ class WindowReplayBuffer(NStepReplayBuffer):
         """
         Add one transition of every env, not normalized, with the arguments of SB3's buffer.
 
-        :raises ValueError: when a stack is not made of the frames before it; nothing is added then
+        :raises ValueError: when a stack that was asked for is not made of the frames before it; nothing is added then
         """
         current, following = self._by_key(obs), self._by_key(next_obs)
         action = np.asarray(action).reshape(self.n_envs, self.action_dim)
@@ -214,7 +219,17 @@ class WindowReplayBuffer(NStepReplayBuffer):
         done = np.array(done, bool).reshape(self.n_envs)  # a copy: it is looked at again with the next transition
         starts = self._starts(current)
         for key, store in self.stores.items():
-            store.check(current[key], following[key], starts, done, self.n_added)
+            problem = store.problem(current[key], following[key], starts, done, self.n_added)
+            if problem and not self.frame_stack_detected:
+                raise ValueError(f"{problem}. {STACK_ADVICE}")
+            if problem:
+                self._store_whole(key)
+                size = self.stores[key].frames.nbytes / 1e9
+                warnings.warn(
+                    f"{problem}. The stack was detected, not asked for: whole observations are stored instead, which takes "
+                    f"{store.stack} times the memory, {size:.2g} GB in a full replay buffer. {STACK_ADVICE}",
+                    stacklevel=2,
+                )
 
         self._truncate(starts & ~self._episode_over)
         for key, store in self.stores.items():
@@ -285,31 +300,51 @@ class WindowReplayBuffer(NStepReplayBuffer):
             if state[name] != getattr(self, name):
                 raise ValueError(f"the state is of a replay buffer with {name}={state[name]}, not {getattr(self, name)}")
         self.reset()
+        for key, stored in state["stores"].items():
+            if stored["frames"].shape[2:] != self.stores[key].frame_shape:  # a detected stack did not hold there
+                self._store_whole(key)
+            self.stores[key].load_training_state(stored)
         self._count(state["n_added"])
         for name, values in state["arrays"].items():
             getattr(self, name)[: len(values)] = values.numpy()
-        for key, store in self.stores.items():
-            store.load_training_state(state["stores"][key])
         self._episode_over = np.array(state["episode_over"])
         self._truncate(~self._episode_over)
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
     ) -> ReplayBufferSamples | DictReplayBufferSamples:
-        if self.n_steps > 1:
-            # SB3's own code, which reads ``observations`` and ``next_observations``.
-            return super()._get_samples(batch_inds, env)
         indices = batch_inds * self.n_envs + np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        last, rewards, discounts = indices, self._normalize_reward(self._take("rewards", indices)[:, None], env), None
+        if self.n_steps > 1:
+            last, rewards, discounts = self._n_step_returns(indices, env)
         # Observations and next ones together.
-        both = self.gather(indices, np.array([[False], [True]]), env, self.crop_size)
-        dones = self._take("dones", indices) * (1 - self._take("timeouts", indices))
+        both = self.gather(np.stack([indices, last]), np.array([[False], [True]]), env, self.crop_size)
+        dones = self._take("dones", last) * (1 - self._take("timeouts", last))
         return (DictReplayBufferSamples if isinstance(both, dict) else ReplayBufferSamples)(
             map_parts(lambda part: part[0].to(self.device), both),
             self.to_torch(self._take("actions", indices), copy=False),
             map_parts(lambda part: part[1].to(self.device), both),
             self.to_torch(dones[:, None], copy=False),
-            self.to_torch(self._normalize_reward(self._take("rewards", indices)[:, None], env), copy=False),
+            self.to_torch(rewards, copy=False),
+            discounts if discounts is None else self.to_torch(discounts, copy=False),
         )
+
+    def _n_step_returns(self, indices: np.ndarray, env: VecNormalize | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        :return: Flat indices (batch,) of the last of at most ``n_steps`` steps from each of these, up to the episode's end or
+            the newest step; their discounted rewards (batch, 1), and the discounts (batch, 1) of what comes after them
+        """
+        steps = np.arange(self.n_steps)
+        every = (indices[:, None] + steps * self.n_envs) % self.ages.size
+        over = (self._take("dones", every) > 0) | (self._take("timeouts", every) > 0)
+        over |= every // self.n_envs == (self.pos - 1) % self.buffer_size
+        over[:, -1] = True
+        n_more = over.argmax(axis=1)
+        # SB3's own products and sums in float32, so that all is equal to the last bit.
+        rewards = self._normalize_reward(self._take("rewards", every), env) * self.gamma ** steps.astype(np.float32)
+        returns = (rewards * (steps <= n_more[:, None])).sum(axis=1, keepdims=True)
+        last = (indices + n_more * self.n_envs) % self.ages.size
+        return last, returns, self.gamma ** (n_more[:, None] + 1).astype(np.float32)
 
     def _take(self, name: str, indices: np.ndarray) -> np.ndarray:
         """A copy of some rows of an array (buffer_size, n_envs, ...), by flat indices."""

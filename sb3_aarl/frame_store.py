@@ -42,12 +42,12 @@ class FrameStore:
         """The frames (n, stack, *frame_shape) of stacked observations (n, *shape), oldest first."""
         return observations.reshape(len(observations), self.stack, *self.frame_shape)
 
-    def check(
+    def problem(
         self, observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray, done: np.ndarray, number: int
-    ) -> None:
-        """Refuse stacks of transition ``number`` that are not made of the frames before them, naming the wrapper order."""
+    ) -> str | None:
+        """What is wrong with stacks of transition ``number`` that are not made of the frames before them."""
         if self.stack == 1:
-            return
+            return None
         old, new = self.split(observations), self.split(next_observations)
         begins = rows_equal(old[:, :-1], old[:, -1:]) | rows_equal(old[:, :-1], np.zeros_like(old[:, -1:]))
         problems = {
@@ -57,14 +57,11 @@ class FrameStore:
         }
         for problem, wrong in problems.items():
             if wrong.any():
-                raise ValueError(
+                return (
                     f"frame_stack={self.stack} does not fit observations{f' under {self.key!r}' if self.key else ''} of "
-                    f"shape {self.shape} (env {int(wrong.argmax())}, transition {number}): {problem}. The stack has to be the "
-                    "outermost observation wrapper, along the channels, oldest frame first: action repeat, rendering and "
-                    "resizing inside, FrameStackObservation or VecFrameStack outside. If observations are no stacks, pass "
-                    "replay_buffer_kwargs=dict(frame_stack=1). If the environments were stepped outside of learn(), or the "
-                    "buffer was emptied inside an episode, model.set_env(model.get_env()) has learn() reset them"
+                    f"shape {self.shape} (env {int(wrong.argmax())}, transition {number}): {problem}"
                 )
+        return None
 
     def put(self, number: int, observations: np.ndarray, next_observations: np.ndarray, starts: np.ndarray) -> None:
         """Store transition ``number``, the next one; ``starts`` (n_envs,): whether its observation begins an episode."""

@@ -1,6 +1,7 @@
 """SACAux: Soft Actor-Critic whose encoder is also trained with an auxiliary loss."""
 
 import copy
+import io
 import logging
 import math
 import warnings
@@ -67,10 +68,10 @@ class SACAux(SAC):
     :param gradient_steps: As in SB3; -1 for one per transition
     :param action_noise: As in SB3
     :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
-    :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given, but
-        must be given for a class of your own
+    :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. One that is
+        detected and does not hold is given up, with a warning: whole observations are stored
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
-    :param n_steps: Steps of n-step returns, not for Dict observations (as in SB3)
+    :param n_steps: Steps of n-step returns
     :param ent_coef: As in SB3; ``"auto_0.1"`` (default, the paper) learns it from 0.1 on
     :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
     :param target_entropy: As in SB3
@@ -223,6 +224,7 @@ class SACAux(SAC):
         self._n_aux_skipped = 0
         self._q_value_check = QValueCheck()
         self._stored_timesteps = 0  # steps whose transitions are in the buffer
+        self._frame_stack: int | dict[str, int] = 1  # as detected; saved, since load() may have no wrappers to look at
 
         if _init_setup_model:
             self._setup_model()
@@ -235,18 +237,19 @@ class SACAux(SAC):
         if self.replay_buffer_class is None:
             self.replay_buffer_class = WindowReplayBuffer
         # load() compares policy_kwargs with those that were saved, and may change n_steps: they stay as the user gave them.
-        policy_kwargs, n_step = self.policy_kwargs, {}
+        policy_kwargs, replay_buffer_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
         self.policy_kwargs = {"augmentation": self.augmentation, "crop_size": self.crop_size, **policy_kwargs}
         with warnings.catch_warnings():
-            if self.replay_buffer_class is WindowReplayBuffer:
-                if self.env is not None:  # kept for load() without an environment, where there are no wrappers to look at
-                    self.replay_buffer_kwargs = {"frame_stack": detect_frame_stack(self.env), **self.replay_buffer_kwargs}
+            if issubclass(self.replay_buffer_class, WindowReplayBuffer):
+                if self.env is not None:
+                    self._frame_stack = detect_frame_stack(self.env)
+                self.replay_buffer_kwargs = {"frame_stack": self._frame_stack, **replay_buffer_kwargs}
                 if self.n_steps > 1:  # SB3 expects that no buffer class but its own knows n-step returns
                     warnings.filterwarnings("ignore", message="`n_steps=")
-                    n_step = {"n_steps": self.n_steps, "gamma": self.gamma}
-            replay_buffer_kwargs = self.replay_buffer_kwargs
-            self.replay_buffer_kwargs = replay_buffer_kwargs | n_step
+                    self.replay_buffer_kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}
             super()._setup_model()
+        if isinstance(self.replay_buffer, WindowReplayBuffer):
+            self.replay_buffer.frame_stack_detected = "frame_stack" not in replay_buffer_kwargs
         self.policy_kwargs, self.replay_buffer_kwargs = policy_kwargs, replay_buffer_kwargs
 
         if self.ent_coef_optimizer is not None:
@@ -573,6 +576,13 @@ class SACAux(SAC):
         for name, value in state["counters"].items():
             setattr(self, name, value)
         self._q_value_check = QValueCheck(**state["q_value_check"])
+
+    def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        replay_buffer = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        if self.aux_loss is not None and not isinstance(self.replay_buffer, WindowReplayBuffer):
+            name, self.replay_buffer = type(self.replay_buffer).__name__, replay_buffer
+            raise ValueError(f"{name} has no windows, which aux_loss={self.aux_loss} needs: only aux_loss=None can load it")
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *COMPILED]
