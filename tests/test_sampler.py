@@ -547,6 +547,121 @@ def test_trials_may_be_pruned_before_the_loss_and_its_parameters_fixed() -> None
     assert all(fixed.items() <= trial.params.items() for trial in complete)
 
 
+class Holding(optuna.samplers.BaseSampler):
+    """A sampler around another one. It passes on the three methods that a sampler must have, or one, as CmaEsSampler does."""
+
+    def __init__(self, held: AuxLossSampler, passes_relative: bool) -> None:
+        self.held, self.passes_relative = held, passes_relative
+
+    def infer_relative_search_space(self, study: Any, trial: Any) -> Any:
+        return self.held.infer_relative_search_space(study, trial) if self.passes_relative else {}
+
+    def sample_relative(self, study: Any, trial: Any, search_space: Any) -> Any:
+        return self.held.sample_relative(study, trial, search_space) if self.passes_relative else {}
+
+    def sample_independent(self, *arguments: Any) -> Any:
+        return self.held.sample_independent(*arguments)
+
+
+WRAPPERS: dict[str, Callable[[AuxLossSampler], optuna.samplers.BaseSampler]] = {
+    "partly fixed": lambda sampler: optuna.samplers.PartialFixedSampler({"rate": 0.5}, sampler),
+    "holding": lambda sampler: Holding(sampler, True),
+    "independent": lambda sampler: Holding(sampler, False),
+}
+
+
+@pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
+@pytest.mark.parametrize("max_horizon", [2, 12])
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_a_sampler_that_is_held_by_another_trains_what_is_recorded(wrapper: str, max_horizon: int) -> None:
+    study = make_study(operators=("cosine", "inner"), max_horizon=max_horizon, n_generations=2)
+    sampler, trained = sampler_of(study), {}
+    study.sampler = WRAPPERS[wrapper](sampler)
+
+    def objective(trial: optuna.Trial) -> float:
+        trial.suggest_float("rate", 0, 1)
+        trained[trial.number] = suggest_aux_loss(trial)  # it is not told the space
+        return score(trained[trial.number])
+
+    study.optimize(objective, n_trials=100, callbacks=[sampler.stop_when_complete])
+    assert set(filled_slots(study)) == set(all_slots(12, 12, 2))
+    assert {number: loss_of(study.trials[number]) for number in trained} == trained
+    assert {loss.operator for loss in trained.values()} == {"cosine", "inner"}
+    if wrapper != "independent":  # which draws the horizon before it has a slot
+        assert max(loss.horizon for loss in trained.values()) > max_horizon - 2
+    if wrapper == "holding":
+        alone = make_study(operators=("cosine", "inner"), max_horizon=max_horizon, n_generations=2)
+        assert losses_of(study) == losses_of(run(alone))
+
+
+def test_a_fixed_horizon_that_is_too_long_is_pruned() -> None:
+    study = make_study()
+    with pytest.warns(optuna.exceptions.ExperimentalWarning):
+        study.sampler = optuna.samplers.PartialFixedSampler({"horizon": 5}, study.sampler)
+    with pytest.warns(UserWarning, match="out of range"), pytest.raises(optuna.TrialPruned, match="horizon is 5"):
+        suggest_aux_loss(study.ask())
+
+
+def test_trials_that_violate_a_constraint_are_no_parents_and_not_known_to_the_model() -> None:
+    def search(shift: float) -> optuna.Study:
+        study = make_study(screening=4, population_size=20)
+
+        def objective(trial: optuna.Trial) -> float:
+            loss = suggest_aux_loss(trial)
+            is_feasible = lot(loss, 2) == 0
+            trial.set_constraint("seconds", 0.0 if is_feasible else 1.0)
+            return score(loss) + (0.0 if is_feasible else shift)
+
+        study.optimize(objective, callbacks=[sampler_of(study).stop_when_complete])
+        return study
+
+    study = search(100.0)
+    infeasible = {trial.number for trial in study.trials if any(value > 0 for value in trial.constraints.values())}
+    parents = {number for trial in study.trials for number in trial.user_attrs["parents"]}
+    assert len(infeasible) > 10 and parents and not parents & infeasible
+    assert losses_of(study) == losses_of(search(-100.0))
+
+
+def test_the_last_report_of_a_pruned_trial_is_no_score() -> None:
+    def search(last: float) -> optuna.Study:
+        study = make_study(screening=4, n_generations=2)
+        for _ in range(24):
+            trial = study.ask()
+            loss = suggest_aux_loss(trial)
+            trial.report(last, 1)
+            is_pruned = lot(loss, 3) == 0
+            study.tell(trial, None if is_pruned else score(loss), TrialState.PRUNED if is_pruned else None)
+        return study
+
+    assert losses_of(search(1000.0)) == losses_of(search(0.0))
+
+
+def test_trials_that_are_enqueued_with_a_part_of_their_parameters_differ() -> None:
+    study = make_study(n_random=20, n_prior=0)
+    for _ in range(12):
+        study.enqueue_trial({"horizon": 1})
+    study.optimize(lambda trial: score(suggest_aux_loss(trial)), n_trials=12)
+    assert len({tuple(sorted(trial.params.items())) for trial in study.trials}) > 9  # of 256
+    n_lost = 0
+    for seed in range(50):
+        study = make_study(seed=seed)
+        for _ in range(5):
+            study.enqueue_trial({"horizon": 1})
+        study.optimize(lambda trial: score(suggest_aux_loss(trial)), n_trials=5)
+        n_lost += all(trial.state == TrialState.PRUNED for trial in study.trials)
+    assert n_lost < 3  # a third of all bits are no loss: 1 of 250
+
+
+def test_a_trial_that_is_enqueued_without_its_loss_has_that_of_its_slot() -> None:
+    study = make_study()
+    study.enqueue_trial({"rate": 0.25})
+    trial = study.ask()
+    assert trial.suggest_float("rate", 0, 1) == 0.25
+    suggest_aux_loss(trial)
+    study.tell(trial, 0.0)
+    assert losses_of(study).items() <= losses_of(run(make_study())).items()
+
+
 @pytest.mark.parametrize("pruner", [optuna.pruners.MedianPruner(3), optuna.pruners.HyperbandPruner(1, 9)])
 def test_pruners_work(pruner: optuna.pruners.BasePruner) -> None:
     study = make_study()

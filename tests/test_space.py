@@ -171,6 +171,7 @@ def test_any_sampler_works_and_what_is_invalid_never_reaches_training(
         ({"horizon": 4}, "horizon"),
         ({"horizon": 2, "source/s_t": "yes"}, "source/s_t"),
         ({"horizon": 1, "operator": "l1"}, "operator"),
+        ({"horizon": 1, "operator": "bilinear"}, "operator"),
     ],
     ids=str,
 )
@@ -241,3 +242,30 @@ def test_the_loss_of_a_trial() -> None:
     for trial_params, expected in ((params, loss), ({}, None), ({"horizon": 1}, None), (no_source, None)):
         space = {name: distributions(1)[name] for name in trial_params}
         assert loss_of(optuna.create_trial(params=trial_params, distributions=space, value=0.0)) == expected
+
+
+@pytest.mark.filterwarnings("ignore:The value 13 of the parameter 'horizon' is out of the range")
+@pytest.mark.parametrize("sampler", [AuxLossSampler(max_horizon=15, operators=["inner"], seed=0), TPESampler(seed=0)])
+def test_a_trial_that_is_trained_again_has_its_own_loss(sampler: BaseSampler) -> None:
+    trained = []
+
+    def objective(trial: optuna.trial.BaseTrial) -> float:
+        trained.append(suggest_aux_loss(trial))
+        return trained[-1].horizon
+
+    study = optuna.create_study(sampler=sampler, direction="maximize")
+    study.optimize(objective, n_trials=20, catch=optuna.TrialPruned)
+    best = params_to_loss(study.best_params)
+    objective(study.best_trial)
+    objective(FixedTrial(study.best_params))
+    assert trained[-2:] == [best, best] and best in trained[:-2]
+    if isinstance(sampler, AuxLossSampler):
+        assert best.horizon > 10 and best.operator == "inner"
+
+
+@pytest.mark.parametrize("enqueued", [{"operator": "inner"}, {"negatives": True}])
+def test_an_operator_that_is_enqueued_where_none_is_searched_is_pruned(enqueued: dict[str, Any]) -> None:
+    study = optuna.create_study(sampler=RandomSampler(seed=0))
+    study.enqueue_trial({"horizon": 1, **enqueued})
+    with pytest.raises(optuna.TrialPruned, match=r"was enqueued as"):
+        suggest_aux_loss(study.ask())

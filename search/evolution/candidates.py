@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -36,8 +37,7 @@ class Result(NamedTuple):
 
     number: int
     loss: AuxLoss
-    score: float  # higher is better
-    fitness: float  # the score, minus infinity where the trial was pruned or its score is not finite
+    score: float  # higher is better; NaN where the trial was pruned or infeasible, or its score is not finite
 
 
 class Candidates:
@@ -87,10 +87,11 @@ class Candidates:
             self._plan_next()
         for result in results:
             self.seen.setdefault(result.loss.canonical(), len(self.seen))
+        scored = [result for result in results if not math.isnan(result.score)]
         if self.sampler.screening > 1:
-            self.model.add([result.loss for result in results], [result.score for result in results])
+            self.model.add([result.loss for result in scored], [result.score for result in scored])
         n_parents = max(1, round(self.sampler.parents * len(results)))
-        self.parents = sorted(results, key=lambda result: -result.fitness)[:n_parents]
+        self.parents = sorted(scored, key=lambda result: -result.score)[:n_parents] or list(results)
         self.generation += 1
         self.to_plan.extend(self._round())
 

@@ -17,13 +17,13 @@ from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 from sb3_aarl.search.evolution import space
 from sb3_aarl.search.evolution.candidates import Candidates, Result
+from sb3_aarl.search.evolution.space import SLOT_KEY
 
 from sb3_aarl.aux_loss import AuxLoss
 
 logger = logging.getLogger(__name__)
 
-# System attributes: of a trial, its slot and loss in one piece; of a study, the settings of its sampler.
-SLOT_KEY = "AuxLossSampler:slot"
+# System attribute of a study: the settings of its sampler.
 SETTINGS_KEY = "AuxLossSampler:settings"
 # Optuna's: what study.enqueue_trial was given.
 FIXED_KEY = "fixed_params"
@@ -53,8 +53,15 @@ class AuxLossSampler(BaseSampler):
     A trial gets its slot when it is asked for, and shows it in its user attributes ``generation``, ``slot``, ``attempt``,
     ``operation`` and ``parents``. Its loss depends on the seed, the slot and earlier generations, not on the number of trials
     that run at once. A failed trial, or one that is pruned before it has a loss, frees its slot for another candidate; for the
-    same one if it has the user attribute ``interrupted``. An enqueued trial takes a random slot if there is one; what was not
-    enqueued is drawn at random.
+    same one if it has the user attribute ``interrupted``. A trial that is enqueued with parameters of a loss takes a random
+    slot if there is one, and the others of its parameters are drawn at random.
+
+    Trials that are pruned, have no finite score or violate a constraint (``trial.set_constraint``) are parents only if there
+    are no others in their generation. Other samplers may hold this one (``PartialFixedSampler``, ``independent_sampler``): the
+    loss of a trial is the one that its parameters name.
+
+    Two processes that share a study draw for one slot if they ask at the same moment. They train one loss, and the trial that
+    finishes first counts.
 
     Asking never waits. A trial that finds no free slot gets one more offspring of the last parents and a slot number behind
     all others; it counts if it finishes before its generation is over. Trials of a killed program stay RUNNING and hold their
@@ -105,6 +112,7 @@ class AuxLossSampler(BaseSampler):
         # Operations of all slots. Random ones come first in later generations: they need no parents.
         self._first = ["given"] * len(self.initial) + ["random"] * self.n_random + ["prior"] * self.n_prior
         self._later = [name for name, count in _apportion(shares, self.population_size).items() for _ in range(count)]
+        self._space = space.distributions(self.max_horizon, self.max_horizon, self.operators)
         self._cached: tuple[Any, int, _Slots] | None = None  # storage, study and what is known of its slots
 
     def _check_arguments(self, shares: dict[str, float]) -> None:
@@ -158,34 +166,49 @@ class AuxLossSampler(BaseSampler):
     # Optuna's interface.
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
-        if SLOT_KEY in trial.system_attrs:
-            return  # Optuna's copy of a trial whose heartbeat stopped
-        with LOCK:
-            slots = self._refresh(study)
-            assigned = slots.assign(trial.number, is_enqueued=FIXED_KEY in trial.system_attrs or bool(trial.params))
-            for key, value in assigned.items():
-                study._storage.set_trial_system_attr(trial._trial_id, key, value)
-        trial.system_attrs.update(assigned)
-        for key in ("generation", "slot", "attempt", "operation", "parents"):
-            study._storage.set_trial_user_attr(trial._trial_id, key, assigned[SLOT_KEY][key])
-            trial.user_attrs[key] = assigned[SLOT_KEY][key]
+        fixed = {**trial.params, **trial.system_attrs.get(FIXED_KEY, {})}
+        self._assign(study, trial, is_enqueued=not self._space.keys().isdisjoint(fixed))
+
+    def _assign(self, study: Study, trial: FrozenTrial, is_enqueued: bool = False) -> dict[str, Any]:
+        """The slot of a trial, which gets one if it has none."""
+        if SLOT_KEY not in trial.system_attrs:  # Optuna's copy of a trial whose heartbeat stopped has
+            with LOCK:
+                assigned = self._refresh(study).assign(trial.number, is_enqueued)
+                for key, value in assigned.items():
+                    study._storage.set_trial_system_attr(trial._trial_id, key, value)
+            trial.system_attrs.update(assigned)
+            for key in ("generation", "slot", "attempt", "operation", "parents"):
+                study._storage.set_trial_user_attr(trial._trial_id, key, assigned[SLOT_KEY][key])
+                trial.user_attrs[key] = assigned[SLOT_KEY][key]
+        return trial.system_attrs[SLOT_KEY]
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        return space.distributions(self.max_horizon, self.max_horizon, self.operators)
+        return dict(self._space)
 
     def sample_relative(self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]) -> dict[str, Any]:
-        loss = trial.system_attrs[SLOT_KEY]["loss"]
-        params = {} if loss is None else space.loss_to_params(AuxLoss.parse(loss), self.operators)
-        return {name: value for name, value in params.items() if name in search_space}
+        planned = self._planned(self._assign(study, trial))
+        return {name: value for name, value in planned.items() if name in search_space}
 
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        """What the user searches beside the loss is drawn at random, as a function of the slot like the loss itself."""
-        assigned = trial.system_attrs[SLOT_KEY]
-        key = [assigned[name] for name in ("seed", "generation", "slot", "attempt")] + [zlib.crc32(param_name.encode())]
+        """
+        What the user searches beside the loss is drawn at random, as a function of the slot like the loss itself. Parameters
+        of the loss come here where another sampler holds this one as its ``independent_sampler``.
+        """
+        assigned = self._assign(study, trial)
+        planned = self._planned(assigned)
+        if param_name in planned and planned[param_name] in space.values(param_distribution):
+            return planned[param_name]
+        key = [assigned.get(name, 0) for name in ("seed", "generation", "slot", "attempt", "enqueued")]
+        key.append(zlib.crc32(param_name.encode()))
         sampler = RandomSampler(int(np.random.SeedSequence(key).generate_state(1)[0]))
         return sampler.sample_independent(study, trial, param_name, param_distribution)
+
+    def _planned(self, assigned: dict[str, Any]) -> dict[str, Any]:
+        """The parameters of the loss that is planned for a slot; none where a user enqueued some of them."""
+        loss = assigned["loss"]
+        return {} if loss is None else space.loss_to_params(AuxLoss.parse(loss), self.operators)
 
     def _refresh(self, study: Study) -> "_Slots":
         storage, study_id = study._storage, study._study_id
@@ -259,9 +282,12 @@ class _Slots:
             else:
                 self.failed[generation, slot] += 1
         elif trial.state == TrialState.COMPLETE or loss is not None:  # what was pruned as invalid fills no slot
-            score = math.nan if trial.value is None else self.sign * trial.value
-            is_fit = trial.state == TrialState.COMPLETE and math.isfinite(score)
-            result = None if loss is None else Result(trial.number, loss, score, score if is_fit else -math.inf)
+            # Of a pruned trial the value is its last report, which is not the mean of a whole curve.
+            score = self.sign * trial.value if trial.state == TrialState.COMPLETE and trial.value is not None else math.nan
+            is_feasible = all(value <= 0 for value in trial.constraints.values())
+            result = None
+            if loss is not None:
+                result = Result(trial.number, loss, score if is_feasible and math.isfinite(score) else math.nan)
             if generation >= self.candidates.generation:  # else the choice of parents is settled
                 self.results[generation].setdefault(slot, result)
             while not self._open(self.candidates.generation):
@@ -298,8 +324,9 @@ class _Slots:
             logger.warning("Trial %d is one more of generation %d: trials %s hold its slots", number, generation, others)
         (generation, slot), attempt = free[0], self.failed[free[0]]
         key = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
-        if is_enqueued:
-            return {SLOT_KEY: {**key, "operation": "enqueued", "parents": [], "loss": None}}
+        key |= {"max_horizon": self.sampler.max_horizon, "operators": self.sampler.operators}
+        if is_enqueued:  # an invalid one costs no attempt: the next one in the slot is drawn by its own number
+            return {SLOT_KEY: {**key, "enqueued": number + 1, "operation": "enqueued", "parents": [], "loss": None}}
         if again := self.interrupted.get(free[0]):
             return {name: value for name, value in again.system_attrs.items() if name in (SLOT_KEY, FIXED_KEY)}
         loss, operation, parents = self.candidates.of_slot(generation, slot, attempt)

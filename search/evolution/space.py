@@ -1,5 +1,6 @@
 """The search space: AuxLoss to and from Optuna parameters, and losses drawn at random and from the paper's priors."""
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from typing import Any
@@ -7,11 +8,12 @@ from typing import Any
 import numpy as np
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
-from optuna.trial import FrozenTrial
+from optuna.trial import BaseTrial, FixedTrial, FrozenTrial
 
 from sb3_aarl.aux_loss import LONGEST_HORIZON, OPERATORS, AuxLoss, Token
 
 MAX_HORIZON = 10  # paper, section 2.1
+SLOT_KEY = "AuxLossSampler:slot"  # system attribute of a trial: its slot, its planned loss and the space, in one piece
 
 
 def check_operators(operators: Sequence[str] | None) -> None:
@@ -50,6 +52,13 @@ def distributions(
     return space
 
 
+def values(distribution: BaseDistribution) -> Sequence[Any]:
+    """The values that a parameter of :func:`distributions` can have."""
+    if isinstance(distribution, IntDistribution):
+        return range(distribution.low, distribution.high + 1)
+    return distribution.choices if isinstance(distribution, CategoricalDistribution) else ()
+
+
 def loss_to_params(loss: AuxLoss, operators: Sequence[str] | None = None) -> dict[str, Any]:
     """
     The parameters of a loss, for ``study.enqueue_trial`` and the sampler.
@@ -85,9 +94,10 @@ def loss_of(trial: FrozenTrial) -> AuxLoss | None:
         return None
 
 
-def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
+def suggest_aux_loss(trial: BaseTrial, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
     """
-    Ask a trial for a loss, with any sampler of Optuna.
+    Suggest the parameters of a loss, with any sampler of Optuna. A trial that has them already, such as ``study.best_trial``,
+    returns its loss.
 
     :param trial: The trial
     :param max_horizon: Longest horizon of the space; AuxLossSampler has its own
@@ -96,29 +106,53 @@ def suggest_aux_loss(trial: optuna.Trial, max_horizon: int = MAX_HORIZON, operat
     :raises optuna.TrialPruned: when what the sampler proposes, or a user enqueued, is not valid; nothing was trained then
     """
     check_operators(operators)
-    study: optuna.Study | None = getattr(trial, "study", None)  # a FixedTrial has none
-    if study is not None:
-        # Optuna would redraw what does not fit, and train another loss than the sampler recorded.
-        max_horizon = getattr(study.sampler, "max_horizon", max_horizon)
-        operators = getattr(study.sampler, "operators", operators)
-        _check_enqueued(study.get_trials(deepcopy=False)[trial.number], max_horizon, operators)
+    if isinstance(trial, FrozenTrial) and "horizon" in trial.params:
+        return _loss_or_pruned(trial.params)
+    max_horizon, operators = _space_of(trial, max_horizon, operators)
     params: dict[str, Any] = {"horizon": trial.suggest_int("horizon", 1, max_horizon)}
+    max_horizon, operators = _space_of(trial, max_horizon, operators)  # as independent_sampler it has its slot only now
+    if params["horizon"] > max_horizon and isinstance(trial, optuna.Trial):
+        raise optuna.TrialPruned(f"horizon is {params['horizon']}, longer than {max_horizon}")
     for name, distribution in distributions(params["horizon"], max_horizon, operators).items():
         if isinstance(distribution, CategoricalDistribution):
             params[name] = trial.suggest_categorical(name, distribution.choices)
+    if operators is None and isinstance(trial, FixedTrial):
+        with contextlib.suppress(ValueError):  # it has no operator
+            params["operator"] = trial.suggest_categorical("operator", OPERATORS)
+            params["negatives"] = trial.suggest_categorical("negatives", [False, True])
+    return _loss_or_pruned(params)
+
+
+def _loss_or_pruned(params: Mapping[str, Any]) -> AuxLoss:
     try:
         return params_to_loss(params)
     except ValueError as error:
         raise optuna.TrialPruned(str(error)) from None
 
 
-def _check_enqueued(trial: FrozenTrial, max_horizon: int, operators: Sequence[str] | None) -> None:
-    """Optuna raises for some values that a parameter cannot have, and only warns of others."""
-    enqueued = trial.system_attrs.get("fixed_params", {})
-    for name, distribution in distributions(max_horizon, max_horizon, operators).items():
-        choices = getattr(distribution, "choices", range(1, max_horizon + 1))
-        if name in enqueued and enqueued[name] not in choices:
-            raise optuna.TrialPruned(f"{name} was enqueued as {enqueued[name]!r}, it must be one of {list(choices)}")
+def _space_of(trial: BaseTrial, max_horizon: int, operators: Sequence[str] | None) -> tuple[int, Sequence[str] | None]:
+    """
+    The space of the AuxLossSampler that gave the trial its slot, else the arguments. It is not read from ``study.sampler``,
+    which may be a sampler around that one.
+    """
+    if not isinstance(trial, optuna.Trial):
+        return max_horizon, operators
+    attributes = trial.study.get_trials(deepcopy=False)[trial.number].system_attrs
+    slot = attributes.get(SLOT_KEY, {})
+    max_horizon, operators = slot.get("max_horizon", max_horizon), slot.get("operators", operators)
+    _check_enqueued(attributes.get("fixed_params", {}), max_horizon, operators)
+    return max_horizon, operators
+
+
+def _check_enqueued(enqueued: Mapping[str, Any], max_horizon: int, operators: Sequence[str] | None) -> None:
+    """Optuna raises for some values that a parameter cannot have, only warns of others, and ignores what is not searched."""
+    space = distributions(max_horizon, max_horizon, ("mse",) if operators is None else operators)
+    if operators is None:
+        space["negatives"] = CategoricalDistribution([False])
+    for name, distribution in space.items():
+        if name in enqueued and enqueued[name] not in values(distribution):
+            allowed = list(values(distribution))
+            raise optuna.TrialPruned(f"{name} was enqueued as {enqueued[name]!r}, it must be one of {allowed}")
 
 
 def random_operator(rng: np.random.Generator, operators: Sequence[str] | None) -> tuple[str, bool]:
