@@ -5,7 +5,8 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from sb3_aarl.search.evolution import mutations, space
@@ -13,15 +14,66 @@ from sb3_aarl.search.evolution.surrogate import TokenModel
 
 from sb3_aarl.aux_loss import AuxLoss
 
-if TYPE_CHECKING:
-    from sb3_aarl.search.evolution.sampler import AuxLossSampler
-
 logger = logging.getLogger(__name__)
 
 # Draws for one slot before a duplicate is accepted: only very small spaces run out of new losses.
 MAX_DRAWS = 300
 
 IsKnown = Callable[[AuxLoss], bool]  # whether the search has a canonical form already
+
+
+@dataclass(eq=False, repr=False)
+class Settings:
+    """What decides the candidates of a search; the arguments of ``AuxLossSampler``, where they are explained."""
+
+    population_size: int = 100
+    n_random: int = 100
+    n_prior: int = 25
+    parents: float = 0.25
+    replacement: float = 0.5
+    crossover: float = 0.2
+    horizon_change: float = 0.1
+    random: float = 0.2
+    max_horizon: int = space.MAX_HORIZON
+    operators: Sequence[str] | None = None
+    allow_duplicates: bool = False
+    seed: int | None = None
+    screening: int = 1
+    n_generations: int | None = None
+    initial: Sequence[AuxLoss] = ()
+
+    def __post_init__(self) -> None:
+        self.operators = None if self.operators is None else tuple(self.operators)
+        losses = self.initial if self.allow_duplicates else {loss.canonical(): loss for loss in self.initial}.values()
+        self.initial = tuple(losses)
+        shares = {name: getattr(self, name) for name in ("random", "replacement", "crossover", "horizon_change")}
+        self._check_arguments(shares)
+        # Operations of all slots. Random ones come first in later generations: they need no parents.
+        self._first = ["given"] * len(self.initial) + ["random"] * self.n_random + ["prior"] * self.n_prior
+        self._later = [name for name, count in _apportion(shares, self.population_size).items() for _ in range(count)]
+
+    def _check_arguments(self, shares: dict[str, float]) -> None:
+        positive = {name: getattr(self, name) for name in ("population_size", "max_horizon", "screening", "n_generations")}
+        positive["n_random + n_prior + initial"] = self.n_random + self.n_prior + len(self.initial)
+        for name, number in positive.items():
+            if number is not None and number < 1:
+                raise ValueError(f"{name} must be at least 1, not {number}")
+        for name, number in {**shares, "n_random": self.n_random, "n_prior": self.n_prior, "seed": self.seed}.items():
+            if number is not None and not number >= 0:
+                raise ValueError(f"{name} must not be negative, not {number}")
+        if abs(sum(shares.values()) - 1) > 1e-9:
+            raise ValueError(f"the shares {', '.join(shares)} must sum to 1, not {sum(shares.values())}")
+        if not 0 < self.parents <= 1:
+            raise ValueError(f"parents must be a share in (0, 1], not {self.parents}")
+        space.check_operators(self.operators)
+        for loss in self.initial:
+            space.loss_to_params(loss, self.operators)
+            if loss.horizon > self.max_horizon:
+                raise ValueError(f"initial has {loss}, whose horizon is longer than {self.max_horizon}")
+
+    def operations(self, generation: int) -> list[str]:
+        """The operation of every slot of a generation."""
+        return self._first if generation == 1 else self._later
 
 
 class Candidate(NamedTuple):
@@ -49,12 +101,12 @@ class Candidates:
     that the plan does not depend on the order in which trials finish.
     """
 
-    def __init__(self, sampler: "AuxLossSampler", seed: int):
-        self.sampler = sampler
+    def __init__(self, settings: Settings, seed: int):
+        self.settings = settings
         self.seed = seed
         self.generation = 1  # the first one that is not over
         self.parents: list[Result] = []
-        self.model = TokenModel(sampler.max_horizon)
+        self.model = TokenModel(settings.max_horizon)
         self.plan: dict[tuple[int, int], Candidate] = {}
         self.to_plan = deque(self._round())
         # Canonical forms in the order in which they came, and how many there were at the end of each round.
@@ -63,7 +115,7 @@ class Candidates:
 
     def of_slot(self, generation: int, slot: int, attempt: int) -> Candidate:
         """The candidate of a slot of a generation (from 1), of which ``attempt`` candidates have failed."""
-        if slot >= len(self.sampler.operations(generation)):
+        if slot >= len(self.settings.operations(generation)):
             return self._draw(generation, slot, 0, self.seen.__contains__)
         if attempt == 0:
             while (generation, slot) not in self.plan:
@@ -88,20 +140,20 @@ class Candidates:
         for result in results:
             self.seen.setdefault(result.loss.canonical(), len(self.seen))
         scored = [result for result in results if not math.isnan(result.score)]
-        if self.sampler.screening > 1:
+        if self.settings.screening > 1:
             self.model.add([result.loss for result in scored], [result.score for result in scored])
-        n_parents = max(1, round(self.sampler.parents * len(results)))
+        n_parents = max(1, round(self.settings.parents * len(results)))
         self.parents = sorted(scored, key=lambda result: -result.score)[:n_parents] or list(results)
         self.generation += 1
         self.to_plan.extend(self._round())
 
     def _round_of(self, generation: int, slot: int) -> int:
-        is_early = generation > 1 and self.sampler.operations(generation)[slot] == "random"
+        is_early = generation > 1 and self.settings.operations(generation)[slot] == "random"
         return generation - is_early
 
     def _round(self) -> list[tuple[int, int]]:
         generations = (self.generation, self.generation + 1)
-        slots = [(number, slot) for number in generations for slot in range(len(self.sampler.operations(number)))]
+        slots = [(number, slot) for number in generations for slot in range(len(self.settings.operations(number)))]
         return [slot for slot in slots if self._round_of(*slot) == self.generation]
 
     def _plan_next(self) -> None:
@@ -114,15 +166,15 @@ class Candidates:
 
     def _draw(self, generation: int, slot: int, attempt: int, is_known: IsKnown) -> Candidate:
         rng = np.random.default_rng([self.seed, generation, slot, attempt])
-        operations = self.sampler.operations(generation)
+        operations = self.settings.operations(generation)
         operation = operations[slot % len(operations)]
         if operation == "given" and slot < len(operations) and attempt == 0:
-            return Candidate(self.sampler.initial[slot], operation)
+            return Candidate(self.settings.initial[slot], operation)
         # What replaces a failed random loss must not depend on whether the model knows another generation by then.
         is_early = attempt > 0 and operation == "random"
-        if self.sampler.screening == 1 or not self.model.losses or is_early:
+        if self.settings.screening == 1 or not self.model.losses or is_early:
             return self._draw_new(rng, operation, slot, is_known)
-        offspring = [self._draw_new(rng, operation, slot, is_known) for _ in range(self.sampler.screening)]
+        offspring = [self._draw_new(rng, operation, slot, is_known) for _ in range(self.settings.screening)]
         return offspring[self.model.best([candidate.loss for candidate in offspring], self.model.draw(rng))]
 
     def _draw_new(self, rng: np.random.Generator, operation: str, slot: int, is_known: IsKnown) -> Candidate:
@@ -131,7 +183,7 @@ class Candidates:
         for _ in range(MAX_DRAWS):
             with contextlib.suppress(ValueError):
                 candidate = self._offspring(rng, operation, slot)
-                if self.sampler.allow_duplicates or not is_known(candidate.loss.canonical()):
+                if self.settings.allow_duplicates or not is_known(candidate.loss.canonical()):
                     return candidate
         if operation in ("crossover", "horizon_change"):
             # No two parents of one horizon, two that are almost equal, a space of one horizon.
@@ -142,7 +194,7 @@ class Candidates:
         return candidate
 
     def _offspring(self, rng: np.random.Generator, operation: str, slot: int) -> Candidate:
-        max_horizon, operators = self.sampler.max_horizon, self.sampler.operators
+        max_horizon, operators = self.settings.max_horizon, self.settings.operators
         if operation == "prior":
             prior = space.PRIORS[slot % len(space.PRIORS)]
             return Candidate(prior(rng, max_horizon, operators), operation)
@@ -160,3 +212,13 @@ class Candidates:
             raise ValueError(f"no other parent has horizon {parent.loss.horizon}")
         other = partners[rng.integers(len(partners))]
         return Candidate(mutations.crossover(parent.loss, other.loss, rng), operation, (parent.number, other.number))
+
+
+def _apportion(shares: dict[str, float], total: int) -> dict[str, int]:
+    """Whole numbers that sum to ``total``, as near to the shares as can be (largest remainders)."""
+    exact = {name: round(share * total, 9) for name, share in shares.items()}
+    counts = {name: int(value) for name, value in exact.items()}
+    by_remainder = sorted(exact, key=lambda name: counts[name] - exact[name])
+    for name in by_remainder[: total - sum(counts.values())]:
+        counts[name] += 1
+    return counts

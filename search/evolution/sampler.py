@@ -16,7 +16,7 @@ from optuna.samplers import BaseSampler, RandomSampler
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 from sb3_aarl.search.evolution import space
-from sb3_aarl.search.evolution.candidates import Candidates, Result
+from sb3_aarl.search.evolution.candidates import Candidates, Result, Settings
 from sb3_aarl.search.evolution.space import SLOT_KEY
 
 from sb3_aarl.aux_loss import AuxLoss
@@ -42,7 +42,7 @@ class GenerationProgress(NamedTuple):
 
 
 @dataclass(eq=False, repr=False)
-class AuxLossSampler(BaseSampler):
+class AuxLossSampler(Settings, BaseSampler):
     """
     Evolution of auxiliary losses with the paper's mutations, for ``suggest_aux_loss``.
 
@@ -87,59 +87,13 @@ class AuxLossSampler(BaseSampler):
     :raises ValueError: naming the argument that does not fit
     """
 
-    population_size: int = 100
-    n_random: int = 100
-    n_prior: int = 25
-    parents: float = 0.25
-    replacement: float = 0.5
-    crossover: float = 0.2
-    horizon_change: float = 0.1
-    random: float = 0.2
-    max_horizon: int = space.MAX_HORIZON
-    operators: Sequence[str] | None = None
-    allow_duplicates: bool = False
-    seed: int | None = None
-    screening: int = 1
-    n_generations: int | None = None
-    initial: Sequence[AuxLoss] = ()
-
     def __post_init__(self) -> None:
-        self.operators = None if self.operators is None else tuple(self.operators)
-        losses = self.initial if self.allow_duplicates else {loss.canonical(): loss for loss in self.initial}.values()
-        self.initial = tuple(losses)
-        shares = {name: getattr(self, name) for name in ("random", "replacement", "crossover", "horizon_change")}
-        self._check_arguments(shares)
-        # Operations of all slots. Random ones come first in later generations: they need no parents.
-        self._first = ["given"] * len(self.initial) + ["random"] * self.n_random + ["prior"] * self.n_prior
-        self._later = [name for name, count in _apportion(shares, self.population_size).items() for _ in range(count)]
+        super().__post_init__()
         self._space = space.distributions(self.max_horizon, self.max_horizon, self.operators)
         self._cached: tuple[Any, int, _Slots] | None = None  # storage, study and what is known of its slots
 
-    def _check_arguments(self, shares: dict[str, float]) -> None:
-        positive = {name: getattr(self, name) for name in ("population_size", "max_horizon", "screening", "n_generations")}
-        positive["n_random + n_prior + initial"] = self.n_random + self.n_prior + len(self.initial)
-        for name, number in positive.items():
-            if number is not None and number < 1:
-                raise ValueError(f"{name} must be at least 1, not {number}")
-        for name, number in {**shares, "n_random": self.n_random, "n_prior": self.n_prior, "seed": self.seed}.items():
-            if number is not None and not number >= 0:
-                raise ValueError(f"{name} must not be negative, not {number}")
-        if abs(sum(shares.values()) - 1) > 1e-9:
-            raise ValueError(f"the shares {', '.join(shares)} must sum to 1, not {sum(shares.values())}")
-        if not 0 < self.parents <= 1:
-            raise ValueError(f"parents must be a share in (0, 1], not {self.parents}")
-        space.check_operators(self.operators)
-        for loss in self.initial:
-            space.loss_to_params(loss, self.operators)
-            if loss.horizon > self.max_horizon:
-                raise ValueError(f"initial has {loss}, whose horizon is longer than {self.max_horizon}")
-
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_cached": None}
-
-    def operations(self, generation: int) -> list[str]:
-        """The operation of every slot of a generation."""
-        return self._first if generation == 1 else self._later
 
     def free_slots(self, study: Study) -> int:
         """How many trials that are asked for now would get a slot; 0 when the last generation is over."""
@@ -331,13 +285,3 @@ class _Slots:
             return {name: value for name, value in again.system_attrs.items() if name in (SLOT_KEY, FIXED_KEY)}
         loss, operation, parents = self.candidates.of_slot(generation, slot, attempt)
         return {SLOT_KEY: {**key, "operation": operation, "parents": list(parents), "loss": str(loss)}}
-
-
-def _apportion(shares: dict[str, float], total: int) -> dict[str, int]:
-    """Whole numbers that sum to ``total``, as near to the shares as can be (largest remainders)."""
-    exact = {name: round(share * total, 9) for name, share in shares.items()}
-    counts = {name: int(value) for name, value in exact.items()}
-    by_remainder = sorted(exact, key=lambda name: counts[name] - exact[name])
-    for name in by_remainder[: total - sum(counts.values())]:
-        counts[name] += 1
-    return counts
