@@ -1,5 +1,6 @@
 """The driver: the same losses and scores however many runs are in flight, however they end, and after interruptions."""
 
+import math
 import random
 import sqlite3
 from concurrent.futures import Future
@@ -181,6 +182,26 @@ def test_failures_without_end_end_the_search(tmp_path: Path) -> None:
 
     with pytest.raises(RunFailed, match="10 candidates failed one after the other, the last one: no space left"):
         run()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("pruner", [optuna.pruners.NopPruner(), ThresholdPruner(lower=-1e9)])
+def test_scores_that_are_not_finite_are_failures(
+    value: float, pruner: optuna.pruners.BasePruner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(globals(), "returns", lambda run: [1.0, value, 1.0])
+    executor, rng = Executor(), random.Random(0)
+    search = start(tmp_path, executor, pruner=pruner)
+
+    def run() -> None:
+        for _ in search:
+            executor.evaluate()
+            while executor.pending:
+                executor.end(rng)
+
+    with pytest.raises(RunFailed, match=f"10 candidates failed one after the other, the last one: its mean return is {value}"):
+        run()
+    assert [trial.state for trial in search.study.trials] == [TrialState.FAIL] * 10
 
 
 def test_reports_the_mean_over_the_seeds_and_prunes(tmp_path: Path) -> None:

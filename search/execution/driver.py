@@ -1,6 +1,7 @@
 """The driver: the one process of a search that knows Optuna. It asks, submits, reports and tells."""
 
 import logging
+import math
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -186,6 +187,8 @@ class Driver:
         seconds = round(sum(curve[-1].seconds for curve in curves if curve), 1)
         self._note(trial, {"curve": mean_curve(curves), "seconds": seconds, "device": device})
         checkpoints = submissions[0].run.checkpoints
+        if failure is None:
+            failure = next((f"its mean return is {mean}" for _, mean in mean_curve(curves) if not math.isfinite(mean)), None)
         if failure is not None:
             self._fail(trial, failure)
         elif any(len(curve) < len(checkpoints) for curve in curves):
