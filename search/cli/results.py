@@ -106,7 +106,7 @@ def status(
 ) -> None:
     """Show how far a search, what belongs to it, or a benchmark is: runs done, running, failed, best so far, time to go."""
     import pandas as pd
-    from sb3_aarl.search.execution.storage import STUDY_FILE
+    from sb3_aarl.search.execution.storage import STUDY_FILE, open_storage
     from sb3_aarl.search.studies.status import PARTS, matrix_status, search_status
 
     folder = folder or search
@@ -116,7 +116,7 @@ def status(
     tables: dict[str, pd.DataFrame] = {}
     if storage is not None or path is None or (path / STUDY_FILE).exists():
         ((study, path),) = open_studies([folder], storage).values()
-        progress, runs = search_status(study, path)
+        progress, runs = search_status(study, open_storage(path, storage, create=False), path)
         data["search"] = {**progress._asdict(), "generations": [row._asdict() for row in progress.generations], "runs": runs}
         rows = [(f"generation {row.generation}", *row[1:]) for row in progress.generations]
         tables["search"] = pd.DataFrame(rows, columns=["variant", "runs", "done", "running", "failed"])

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import optuna
-from filelock import FileLock, Timeout
 from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.evolution.space import loss_of, suggest_aux_loss
 from sb3_aarl.search.execution.runs import Executor, RunFailed, Submission, mean_curve
+from sb3_aarl.search.execution.storage import driver_lock
 from sb3_aarl.search.training.provenance import commit, read_about, versions
 from sb3_aarl.search.training.run import Run, partial_curve
 from tenacity import Retrying, before_sleep_log, retry_if_exception_type, stop_after_delay, wait_random_exponential
@@ -32,7 +32,6 @@ POLL_SECONDS = 0.5
 MAX_FAILURES = 10
 # How long a database that is away is waited for.
 PATIENCE_SECONDS = 600
-LOCK = "driver.lock"
 
 
 class SearchProgress(NamedTuple):
@@ -108,12 +107,8 @@ class Driver:
 
     def __iter__(self) -> Iterator[SearchProgress]:
         self.folder.mkdir(parents=True, exist_ok=True)
-        try:
-            lock = FileLock(self.folder / LOCK, timeout=0, fallback_to_soft=False)
-            with lock:
-                yield from self._run()
-        except Timeout:
-            raise ValueError(f"another program runs this search: it holds {self.folder / LOCK}") from None
+        with driver_lock(self.storage, self.study.study_name, self.folder):
+            yield from self._run()
 
     def _run(self) -> Iterator[SearchProgress]:
         try:

@@ -1,12 +1,19 @@
 """Where a search keeps its study: SQLite in its folder, or any database that Optuna knows."""
 
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.storages import RDBStorage
+from filelock import FileLock, Timeout
+from optuna.storages import BaseStorage, RDBStorage
+from sqlalchemy import URL, text
 
 STUDY_FILE = "study.db"
+LOCK = "driver.lock"
+# PostgreSQL's advisory locks have two numbers: this one, and that of the study.
+ADVISORY_LOCK = 5_334_225
 # Readers such as the dashboard hold up a commit of SQLite: it waits so many seconds for them.
 SQLITE_TIMEOUT = 120
 
@@ -27,7 +34,7 @@ def open_storage(folder: Path | None, url: str | None = None, create: bool = Tru
         if not create and not path.exists():
             raise ValueError(f"{folder} has no search: {path} does not exist. aarl search starts one")
         folder.mkdir(parents=True, exist_ok=True)
-        url = f"sqlite:///{path}"
+        url = URL.create("sqlite", database=str(path)).render_as_string()  # which quotes `?` and `%`
     engine: dict[str, Any] = {"pool_pre_ping": True}  # a connection that a restarted server has closed is opened again
     if url.startswith("sqlite"):
         engine = {"connect_args": {"timeout": SQLITE_TIMEOUT}}
@@ -47,3 +54,59 @@ def load_study(storage: RDBStorage, name: str | None = None) -> optuna.Study:
         wanted = "which study?" if name is None else f"there is no study {name!r}."
         raise ValueError(f"{wanted} The storage has: {', '.join(names) or 'none'}")
     return optuna.load_study(study_name=name, storage=storage)
+
+
+@contextmanager
+def driver_lock(storage: BaseStorage, study_name: str, folder: Path) -> Iterator[None]:
+    """
+    Hold the locks of a search: that of its folder, and that of its study, which drivers with other folders may share. The
+    latter is a file beside a database of SQLite, and the database's own in PostgreSQL, as long as the server runs.
+
+    :raises ValueError: when another program holds one of them
+    """
+    with ExitStack() as stack:
+        for path in _lock_files(storage, study_name, folder):
+            try:
+                stack.enter_context(FileLock(path, timeout=0, fallback_to_soft=False))
+            except Timeout:
+                raise ValueError(f"another program runs this search: it holds {path}") from None
+        if not stack.enter_context(_advisory_lock(storage, study_name)):
+            raise ValueError(f"another program runs this search: it holds the lock of study {study_name!r} in the database")
+        yield
+
+
+def has_driver(storage: BaseStorage, study_name: str, folder: Path) -> bool:
+    """Whether a driver holds one of the locks of a search; locks that are files are those of this machine."""
+    with _advisory_lock(storage, study_name) as is_free:
+        return not is_free or any(map(is_locked, _lock_files(storage, study_name, folder)))
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a process holds a lock."""
+    if not path.exists():
+        return False
+    try:
+        with FileLock(path, timeout=0, fallback_to_soft=False):
+            return False
+    except Timeout:
+        return True
+
+
+def _lock_files(storage: BaseStorage, study_name: str, folder: Path) -> list[Path]:
+    files = [folder / LOCK]
+    if isinstance(storage, RDBStorage) and storage.engine.name == "sqlite" and storage.engine.url.database:
+        path = Path(storage.engine.url.database).resolve()
+        files.append(path.with_name(f"{path.name}.{storage.get_study_id_from_name(study_name)}.lock"))
+    return files
+
+
+@contextmanager
+def _advisory_lock(storage: BaseStorage, study_name: str) -> Iterator[bool]:
+    """Hold PostgreSQL's lock of a study, or not: whether it was free. Other databases have none."""
+    if not isinstance(storage, RDBStorage) or storage.engine.name != "postgresql":
+        yield True
+        return
+    with closing(storage.engine.execution_options(isolation_level="AUTOCOMMIT").connect()) as connection:
+        connection.detach()  # else it would return to the pool with the lock
+        numbers = {"search": ADVISORY_LOCK, "study": storage.get_study_id_from_name(study_name)}
+        yield bool(connection.scalar(text("SELECT pg_try_advisory_lock(:search, :study)"), numbers))

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import optuna
 import pandas as pd
-from filelock import FileLock, Timeout
+from optuna.storages import BaseStorage
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.execution import driver
 from sb3_aarl.search.execution.matrix import share_left
+from sb3_aarl.search.execution.storage import has_driver, is_locked
 from sb3_aarl.search.studies.search import SETTINGS_KEY
 from sb3_aarl.search.training.provenance import read_about
 from sb3_aarl.search.training.run import LOCK, RUN, partial_curve, read_outcome, read_run
@@ -21,13 +22,13 @@ from sb3_aarl.callbacks import aulc
 PARTS = ("baselines", "cross-validation", "operators")
 
 
-def search_status(study: optuna.Study, folder: Path) -> tuple[driver.SearchProgress, bool]:
-    """The progress of a search, and whether its driver runs on this machine."""
+def search_status(study: optuna.Study, storage: BaseStorage, folder: Path) -> tuple[driver.SearchProgress, bool]:
+    """The progress of a search, and whether its driver runs."""
     settings = dict(study.user_attrs[SETTINGS_KEY])
     settings["initial"] = [AuxLoss.parse(loss) for loss in settings["initial"]]
     names = inspect.signature(AuxLossSampler).parameters
     sampler = AuxLossSampler(**{name: settings[name] for name in names if name in settings})
-    return driver.search_progress(study, sampler), is_locked(folder / driver.LOCK)
+    return driver.search_progress(study, sampler), has_driver(storage, study.study_name, folder)
 
 
 def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
@@ -56,14 +57,3 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     # A run's seconds at the pace that it had so far.
     to_go = runs["seconds"].mean() * runs["left"].sum() / max(1, runs["running"].sum())
     return table.reset_index(), 0.0 if runs["left"].isna().all() else None if math.isnan(to_go) else float(to_go)
-
-
-def is_locked(path: Path) -> bool:
-    """Whether a process holds a lock."""
-    if not path.exists():
-        return False
-    try:
-        with FileLock(path, timeout=0, fallback_to_soft=False):
-            return False
-    except Timeout:
-        return True
