@@ -9,9 +9,12 @@ from typing import Any
 
 import optuna
 import pytest
+import sqlalchemy
+from optuna.exceptions import StorageInternalError
 from optuna.pruners import ThresholdPruner
 from optuna.storages import BaseStorage, InMemoryStorage
 from optuna.trial import TrialState
+from sb3_aarl.search.cli.main import explain
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import loss_of, loss_to_params, suggest_aux_loss
 from sb3_aarl.search.execution import driver
@@ -150,6 +153,39 @@ def test_an_interrupted_query_does_not_lock_the_study(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         list(search)
     assert [trial.state for trial in search.study.trials] == [TrialState.FAIL]
+
+
+def test_a_full_disk_ends_the_search_at_once_with_its_cause(tmp_path: Path) -> None:
+    storage = STORAGES[tmp_path] = open_storage(tmp_path)
+    executor, rng = Executor(), random.Random(0)
+    search = start(tmp_path, executor)
+
+    @sqlalchemy.event.listens_for(storage.engine, "connect")
+    def fill(connection: Any, record: Any) -> None:
+        connection.execute("PRAGMA max_page_count = 1")  # SQLite takes the present size
+
+    def run() -> None:
+        for _ in search:
+            while executor.pending:
+                executor.end(rng)
+
+    storage.engine.dispose()
+    with pytest.raises(StorageInternalError) as error:
+        run()
+    assert explain(error.value) == "(sqlite3.OperationalError) database or disk is full"
+
+
+def test_a_database_that_another_program_holds_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_aarl.search.execution.storage.SQLITE_TIMEOUT", 0)
+    STORAGES[tmp_path] = open_storage(tmp_path)
+    search = start(tmp_path, Executor())
+    progresses = iter(search)
+    next(progresses)
+    other, tries = sqlite3.connect(tmp_path / "study.db", isolation_level=None), []
+    other.execute("BEGIN EXCLUSIVE")
+    search._patiently.sleep = lambda seconds: tries.append(seconds) or other.close()
+    next(progresses)
+    assert len(tries) == 1
 
 
 def test_a_second_driver_is_refused(tmp_path: Path) -> None:

@@ -51,11 +51,12 @@ def explain(error: Exception) -> str | None:
     if "sb3_aarl.search.execution.storage" in sys.modules:
         from optuna.exceptions import StorageInternalError
         from sb3_aarl.search.execution.runs import RunFailed
+        from sb3_aarl.search.execution.storage import cause
         from sb3_aarl.search.training.provenance import hide_password
         from sqlalchemy.exc import SQLAlchemyError
 
         kinds += [RunFailed, StorageInternalError, SQLAlchemyError]
-        line = hide_password(line)
+        line = hide_password(cause(error) if isinstance(error, StorageInternalError) else line)
     # A closed pipe, as of `| head`, is Typer's.
     return line if isinstance(error, tuple(kinds)) and not isinstance(error, BrokenPipeError) else None
 

@@ -11,16 +11,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import optuna
-from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.evolution.space import loss_of, suggest_aux_loss
 from sb3_aarl.search.execution.runs import Executor, RunFailed, Submission, mean_curve
-from sb3_aarl.search.execution.storage import driver_lock
+from sb3_aarl.search.execution.storage import cause, driver_lock, is_temporary
 from sb3_aarl.search.training.provenance import commit, read_about, versions
 from sb3_aarl.search.training.run import Run, partial_curve
-from tenacity import Retrying, before_sleep_log, retry_if_exception_type, stop_after_delay, wait_random_exponential
+from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import aulc
@@ -98,10 +97,10 @@ class Driver:
         self.n_failures = 0
         # A database that is away for a while fails any of the calls; all may be repeated.
         self._patiently = Retrying(
-            retry=retry_if_exception_type(StorageInternalError),
+            retry=retry_if_exception(is_temporary),
             wait=wait_random_exponential(multiplier=0.5, max=30),
             stop=stop_after_delay(PATIENCE_SECONDS),
-            before_sleep=before_sleep_log(logger, logging.WARNING),
+            before_sleep=_warn,
             reraise=True,
         )
 
@@ -220,6 +219,11 @@ class Driver:
         self._patiently(self.on_change, trial)
         self._patiently(self.study.tell, trial, values, state, skip_if_finished=True)
         self.running.pop(trial.number, None)
+
+
+def _warn(attempt: RetryCallState) -> None:
+    assert attempt.outcome is not None
+    logger.warning("The storage is tried again: %s", cause(attempt.outcome.exception()))
 
 
 def search_progress(study: optuna.Study, sampler: AuxLossSampler) -> SearchProgress:

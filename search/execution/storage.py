@@ -1,5 +1,6 @@
 """Where a search keeps its study: SQLite in its folder, or any database that Optuna knows."""
 
+import sqlite3
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 import optuna
 from filelock import FileLock, Timeout
+from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, RDBStorage
 from sqlalchemy import URL, text
 
@@ -54,6 +56,22 @@ def load_study(storage: RDBStorage, name: str | None = None) -> optuna.Study:
         wanted = "which study?" if name is None else f"there is no study {name!r}."
         raise ValueError(f"{wanted} The storage has: {', '.join(names) or 'none'}")
     return optuna.load_study(study_name=name, storage=storage)
+
+
+def cause(error: BaseException | None) -> str:
+    """The database's own message in one line; that of Optuna's ``StorageInternalError`` blames invalid data for everything."""
+    return str(getattr(error, "__cause__", None) or error).splitlines()[0]
+
+
+def is_temporary(error: BaseException) -> bool:
+    """Whether a database may work again on its own: it is away, starts, or another program holds it."""
+    original = getattr(error.__cause__, "orig", None) if isinstance(error, StorageInternalError) else None
+    if original is None:
+        return False
+    if isinstance(original, sqlite3.Error):
+        return "locked" in str(original)
+    # PostgreSQL's classes: lost connection, deadlock, too many connections, shutdown. Without a server there is none.
+    return (getattr(original, "sqlstate", None) or "08").startswith(("08", "40", "53300", "57"))
 
 
 @contextmanager
