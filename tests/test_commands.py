@@ -9,11 +9,16 @@ from pathlib import Path
 import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
+import optuna
 import pytest
 import sb3_aarl.search.cli.console
 from executors import Planted
 from filelock import FileLock
+from optuna.samplers import BaseSampler, RandomSampler
 from sb3_aarl.search.cli.main import app
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import suggest_aux_loss
+from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.studies.config import load_config
 from sb3_aarl.search.studies.cost import measure
 from sb3_aarl.search.training.run import prepare_run, train
@@ -206,12 +211,34 @@ def test_status_of_a_search_and_its_baselines(folder: Path, executor: Planted) -
     shown, data = run("status", "small.yml"), json.loads(run("status", "runs/small", "--json"))
     assert re.search(r"generation 1 +│ +3 │ +3 │ +0 │ +0 │", shown)
     assert data["search"]["best_loss"] in shown and f"score {data['search']['best']:.2f}; finished" in shown
+    write_search(folder, BASELINES + "overrides: {gamma: 0.5}\n")
+    assert "it was started with gamma=None, not 0.5" in run("baselines", "small.yml", code=2)
+    write_search(folder, BASELINES)
     run("baselines", "small.yml")
     shown, data = run("status"), json.loads(run("status", "small", "--json"))
     assert {row["variant"] for row in json.loads(run("baselines", "small.yml", "--json", stdout=True))} == {"CURL", "SAC"}
     score = np.mean([point.mean for point in read_curve("runs/small/baselines/SAC/Pendulum-v1/seed-0/curve.csv")])
     assert [row["variant"] for row in data["baselines"]["variants"]] == ["CURL", "SAC"]
     assert re.search(rf"SAC +│ +1 │ +1 │ +0 │ +0 │ +{score:.2f} ", shown)
+
+
+@pytest.mark.parametrize("sampler", [AuxLossSampler(seed=0, population_size=2, n_random=2, n_prior=0), RandomSampler(seed=0)])
+def test_status_of_a_study_made_in_python(sampler: BaseSampler) -> None:
+    def objective(trial: optuna.Trial) -> float:
+        loss = suggest_aux_loss(trial)
+        if trial.number == 0:
+            raise ValueError
+        return float(loss.horizon)
+
+    study = optuna.create_study(
+        storage=open_storage(Path("runs/own")), sampler=sampler, direction="maximize", study_name="own"
+    )
+    study.optimize(objective, 40, catch=ValueError, callbacks=[lambda study, trial: trial.value is None or study.stop()])
+    data = json.loads(run("status", "own", "--json"))["search"]
+    (generation,) = data["generations"]
+    assert (generation["running"], generation["filled"]) == (0, len(study.trials) - generation["failed"])
+    assert data["best"] == study.best_value and not data["runs"]
+    assert f"score {study.best_value:.2f}" in run("status", "own")
 
 
 def test_status_of_a_benchmark(folder: Path) -> None:

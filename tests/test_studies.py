@@ -83,7 +83,7 @@ def test_a_search_with_other_settings_is_another_one(
     storage = InMemoryStorage()
     study, _ = open_search(config, storage)
     stored = study.user_attrs
-    with pytest.raises(ValueError, match=f"'small' is not this search: it was started with {message}"):
+    with pytest.raises(ValueError, match=f"this (search: it|study) was started with {message}"):
         open_search(config.model_copy(update=changed), storage)
     assert optuna.load_study(study_name="small", storage=storage).user_attrs == stored
 
@@ -145,10 +145,23 @@ def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, capl
     longer = config.cross_validation.model_copy(update={"checkpoints": {"Pendulum-v1": (800,)}})
     matrix = cross_validation.make_matrix(config.model_copy(update={"cross_validation": longer}), study, tmp_path)
     assert {run.checkpoints for run in matrix.runs.values() if run.environment == "Pendulum-v1"} == {(800,)}
-    cross_validation.make_matrix(config.model_copy(update={"seeds": (0, 2)}), study, tmp_path, top=1)
-    assert "seeds has 2, as the search" in caplog.text
+    same = config.cross_validation.model_copy(update={"seeds": (0, 2)})
+    more = {"cross_validation": same, "threads": 2, "generations": 3}
+    cross_validation.make_matrix(config.model_copy(update=more), study, tmp_path, top=1)
+    assert "seeds has 0, as the search" in caplog.text
     with pytest.raises(ConfigError, match="cross_validation is missing"):
         cross_validation.make_matrix(config.model_copy(update={"cross_validation": None}), study, tmp_path)
+
+
+@pytest.mark.parametrize("changed", [{"overrides": {"batch_size": 16}}, {"evaluation_episodes": 2}], ids=str)
+def test_a_file_that_differs_from_its_study_is_not_cross_validated(
+    config: SearchConfig, tmp_path: Path, changed: dict[str, Any]
+) -> None:
+    study, _ = open_search(config, InMemoryStorage())
+    add_trials(study, [5.0, 9.0, 8.0])
+    (key,) = changed.get("overrides", changed)
+    with pytest.raises(ValueError, match=f"study 'small' is not this search: it was started with {key}="):
+        cross_validation.make_matrix(config.model_copy(update=changed), study, tmp_path)
 
 
 def test_finalists_that_the_surrogate_rates_highest() -> None:

@@ -77,13 +77,17 @@ def baselines(
     config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
 ) -> None:
     """Train the baselines of a search, which its candidates are compared with."""
+    from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
     from sb3_aarl.search.studies import search
     from sb3_aarl.search.studies.cross_validation import ranking
 
     settings = read_config(config, threads=threads)
     if not settings.baselines:
         raise ValueError(f"{config} names no baselines")
-    matrix = search.baselines(settings, run_folder(config, folder))
+    path = run_folder(config, folder)
+    if (path / STUDY_FILE).exists():
+        search.check_study(load_study(open_storage(path), settings.name), settings, free=("threads",))
+    matrix = search.baselines(settings, path)
     train_matrix(matrix, workers, settings.retries)
     compare(matrix, ranking, "Baselines, AULC", json)
     exit_if_failed(matrix)

@@ -117,6 +117,11 @@ class AuxLossSampler(Settings, BaseSampler):
             slots = self._refresh(study)
             return [slots.progress(number) for number in range(1, 1 + (self.n_generations or slots.last_started))]
 
+    @staticmethod
+    def stored_settings(study: Study) -> dict[str, Any]:
+        """The arguments of the sampler that a study was started with, as plain values; none if it had another sampler."""
+        return study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY, {})
+
     # Optuna's interface.
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
@@ -179,8 +184,8 @@ class AuxLossSampler(Settings, BaseSampler):
         # Without n_generations: a search may be continued.
         names = [field.name for field in fields(self) if field.name not in ("seed", "n_generations")]
         settings = json.loads(json.dumps({name: getattr(self, name) for name in names}, default=str))
-        stored = study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY)
-        if stored is None:
+        stored = self.stored_settings(study)
+        if not stored:
             seed = int(np.random.SeedSequence().generate_state(1)[0]) if self.seed is None else self.seed
             stored = {**settings, "seed": seed}
             study._storage.set_study_system_attr(study._study_id, SETTINGS_KEY, stored)

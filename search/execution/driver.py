@@ -117,7 +117,7 @@ class Driver:
                     self._check(running)
                 while self._has_room() and self._patiently(self.sampler.free_slots, self.study) > 0:
                     self._start(self._patiently(self._ask))
-                yield self._patiently(search_progress, self.study, self.sampler)
+                yield self._patiently(lambda: search_progress(self.study, self.sampler.progress(self.study)))
                 if not self.running and self._patiently(self.sampler.is_complete, self.study):
                     return
                 time.sleep(POLL_SECONDS)
@@ -226,9 +226,8 @@ def _warn(attempt: RetryCallState) -> None:
     logger.warning("The storage is tried again: %s", cause(attempt.outcome.exception()))
 
 
-def search_progress(study: optuna.Study, sampler: AuxLossSampler) -> SearchProgress:
-    """How far a search is."""
-    generations = sampler.progress(study)
+def search_progress(study: optuna.Study, generations: list[GenerationProgress]) -> SearchProgress:
+    """How far a search is whose generations are so far."""
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     best = study.best_trial if complete else None
     seconds = [trial.duration.total_seconds() for trial in complete if trial.duration is not None]

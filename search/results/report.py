@@ -16,7 +16,7 @@ from sb3_aarl.search.execution.matrix import comparable, stored_scores, task_nam
 from sb3_aarl.search.results import analysis
 from sb3_aarl.search.results.plots import evolution_plot, patterns_plot, rankings_plot
 from sb3_aarl.search.studies import cross_validation
-from sb3_aarl.search.studies.search import SETTINGS_KEY
+from sb3_aarl.search.studies.search import stored_settings
 from sb3_aarl.search.training.provenance import provenance
 
 from sb3_aarl.callbacks import replace_text
@@ -59,7 +59,7 @@ def write_report(
     )
     html = environment.get_template("report.html").render(
         study=study,
-        settings=study.user_attrs.get(SETTINGS_KEY, {}),
+        settings=stored_settings(study),
         counts=Counter(table["state"]),
         hours=summary.tables["machines"]["hours"].sum(),
         generations=analysis.readable("generations", generation_table(table)),

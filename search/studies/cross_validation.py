@@ -13,7 +13,7 @@ from sb3_aarl.search.evolution.surrogate import TokenModel
 from sb3_aarl.search.execution.matrix import Cell, Matrix
 from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
-from sb3_aarl.search.studies.search import make_run
+from sb3_aarl.search.studies.search import check_study, make_run
 from sb3_aarl.search.training.config import ConfigError
 from sb3_aarl.search.training.run import Run
 
@@ -42,8 +42,13 @@ def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLos
 def make_matrix(
     config: SearchConfig, study: optuna.Study, folder: Path, top: int | None = None, baselines: Sequence[Baseline] = ()
 ) -> Matrix:
-    """Candidates and baselines x environments x seeds; ``top`` replaces the configuration's number of candidates."""
+    """
+    Candidates and baselines x environments x seeds; ``top`` replaces the configuration's number of candidates.
+
+    :raises ValueError: when the configuration is not that of the study
+    """
     section = _section(config)
+    check_study(study, config, free=("threads",))
     if config.environment in section.environments and (own := sorted({*config.seeds} & {*section.seeds})):
         logger.warning(
             "cross_validation.seeds has %s, as the search on %s: the scores that candidates were chosen for count again",

@@ -1,7 +1,7 @@
 """The search for auxiliary losses (paper, sections 2.2 and 3): its study, its sampler and the runs of its candidates."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from sb3_aarl.aux_loss import AuxLoss
 SETTINGS_KEY = "settings"  # user attribute of a study
 # Settings that may change when a search is resumed, beside those of its runs.
 FREE_OF_SEARCH = ("n_generations", "pruner")
+ADVICE = "Another search needs a file of another name, another folder or another storage"
 
 
 def make_run(
@@ -73,9 +74,10 @@ def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Stud
         direction="maximize",
         load_if_exists=True,
     )
-    if difference := _difference(study, config):
-        advice = "Another search needs a file of another name, another folder or another storage"
-        raise ValueError(f"study {study.study_name!r} is not this search: {difference}. {advice}")
+    check_study(study, config)
+    if SETTINGS_KEY not in study.user_attrs and any(trial.state != TrialState.WAITING for trial in study.trials):
+        raise ValueError(f"study {study.study_name!r} is not this search: it has trials of another program. {ADVICE}")
+    sampler.progress(study)  # which refuses a study with other settings of the sampler
     study.set_user_attr(SETTINGS_KEY, settings(config))
     return study, sampler
 
@@ -99,22 +101,30 @@ def baselines(config: SearchConfig, folder: Path) -> Matrix:
 
 
 def settings(config: SearchConfig) -> dict[str, Any]:
-    """All that decides the losses and the scores of a search, in plain values as they are read from JSON."""
-    run = make_run(config, config.environment, None, config.seed)
-    values = run.model_dump(exclude={"aux_loss", "hyperparameters", "keep_model"}) | config.sampler_settings()
-    values |= {"initial": [str(loss) for loss in values["initial"]], "seeds": config.seeds, "pruner": config.pruner}
+    """What decides the scores of a search, in plain values as they are read from JSON; the sampler stores what it does."""
+    run = make_run(config, config.environment, None, 0)
+    values = run.model_dump(exclude={"aux_loss", "hyperparameters", "keep_model", "seed"})
+    values |= {"seed": config.seed, "seeds": config.seeds, "n_generations": config.generations, "pruner": config.pruner}
     return json.loads(json.dumps(values | run.hyperparameters))
 
 
-def _difference(study: optuna.Study, config: SearchConfig) -> str | None:
-    """The first thing that makes a study another one than that of a search."""
+def stored_settings(study: optuna.Study) -> dict[str, Any]:
+    """All settings that a study was started with, those of its sampler included; none if it was made by another program."""
+    return AuxLossSampler.stored_settings(study) | study.user_attrs.get(SETTINGS_KEY, {})
+
+
+def check_study(study: optuna.Study, config: SearchConfig, free: Sequence[str] = ()) -> None:
+    """
+    Compare the settings of a study with those of a file.
+
+    :param free: Settings that may differ
+    :raises ValueError: naming the first setting that differs
+    """
+    stored, problem = study.user_attrs.get(SETTINGS_KEY), None
     if study.directions != [StudyDirection.MAXIMIZE]:
-        return f"its directions are {[direction.name.lower() for direction in study.directions]}, not one to maximize"
-    stored, wanted = study.user_attrs.get(SETTINGS_KEY), settings(config)
-    if stored is None:
-        has_trials = any(trial.state != TrialState.WAITING for trial in study.get_trials(deepcopy=False))
-        return "it has trials of another program" if has_trials else None
-    for key, old, new in differences(stored, wanted):
-        if key not in FREE + FREE_OF_SEARCH:
-            return f"it was started with {key}={old!r}, not {new!r}"
-    return None
+        problem = f"its directions are {[direction.name.lower() for direction in study.directions]}, not one to maximize"
+    elif stored is not None:
+        found = [item for item in differences(stored, settings(config)) if item[0] not in (*FREE, *FREE_OF_SEARCH, *free)]
+        problem = next((f"it was started with {key}={old!r}, not {new!r}" for key, old, new in found), None)
+    if problem is not None:
+        raise ValueError(f"study {study.study_name!r} is not this search: {problem}. {ADVICE}")

@@ -2,16 +2,18 @@
 
 import inspect
 import math
+from collections import Counter
 from pathlib import Path
 
 import optuna
 import pandas as pd
 from optuna.storages import BaseStorage
-from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from optuna.trial import TrialState
+from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.execution import driver
 from sb3_aarl.search.execution.matrix import share_left
 from sb3_aarl.search.execution.storage import has_driver, is_locked
-from sb3_aarl.search.studies.search import SETTINGS_KEY
+from sb3_aarl.search.studies.search import stored_settings
 from sb3_aarl.search.training.provenance import read_about
 from sb3_aarl.search.training.run import LOCK, RUN, partial_curve, read_outcome, read_run
 
@@ -23,12 +25,20 @@ PARTS = ("baselines", "cross-validation", "operators")
 
 
 def search_status(study: optuna.Study, storage: BaseStorage, folder: Path) -> tuple[driver.SearchProgress, bool]:
-    """The progress of a search, and whether its driver runs."""
-    settings = dict(study.user_attrs[SETTINGS_KEY])
-    settings["initial"] = [AuxLoss.parse(loss) for loss in settings["initial"]]
-    names = inspect.signature(AuxLossSampler).parameters
-    sampler = AuxLossSampler(**{name: settings[name] for name in names if name in settings})
-    return driver.search_progress(study, sampler), has_driver(storage, study.study_name, folder)
+    """
+    The progress of a search, and whether its driver runs. All trials of a study without an ``AuxLossSampler`` count as one
+    generation.
+    """
+    if settings := stored_settings(study):
+        settings["initial"] = [AuxLoss.parse(loss) for loss in settings["initial"]]
+        arguments = {name: settings[name] for name in inspect.signature(AuxLossSampler).parameters if name in settings}
+        generations = AuxLossSampler(**arguments).progress(study)
+    else:
+        states = Counter(trial.state for trial in study.get_trials(deepcopy=False))
+        filled = states[TrialState.COMPLETE] + states[TrialState.PRUNED]
+        running, failed = states[TrialState.RUNNING], states[TrialState.FAIL]
+        generations = [GenerationProgress(1, sum(states.values()) - failed, filled, running, failed)]
+    return driver.search_progress(study, generations), has_driver(storage, study.study_name, folder)
 
 
 def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
