@@ -135,7 +135,7 @@ def test_all_files_are_installed() -> None:
         path
         for package in settings["options"]["packages"].split()
         for pattern in ("*.py", *data.get(package, "").split())
-        for path in (ROOT / package.replace(".", "/")).glob(pattern)
+        for path in (ROOT / package.removeprefix("sb3_aarl.").replace(".", "/")).glob(pattern)
     }
     there = {path for name in ("sb3_aarl", "search", "zoo_configs") for path in (ROOT / name).rglob("*") if path.is_file()}
     assert installed == {path for path in there if "__pycache__" not in path.parts}
