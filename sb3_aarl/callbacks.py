@@ -3,7 +3,6 @@
 import csv
 import io
 import time
-import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +14,8 @@ from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
+
+from sb3_aarl.files import replace_text
 
 
 class Evaluation(NamedTuple):
@@ -179,17 +180,6 @@ class LearningCurveCallback(BaseCallback):
     def aulc(self) -> float:
         """Area under the learning curve so far."""
         return aulc(self.curve)
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a file in one step, and make its folder: other processes may read it, or write it too, at any time."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        unfinished.write_text(text, encoding="utf-8", newline="")
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)  # what is left of it on a full disk
 
 
 def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_aarl.aux_loss import AuxLoss, Token
+from sb3_aarl.files import read_yaml
 
 
 class PublishedLoss(NamedTuple):
@@ -99,12 +100,12 @@ def resolve(value: "AuxLoss | str | Path | Mapping[str, Any]") -> AuxLoss:
     """
     if isinstance(value, AuxLoss):
         return value
-    if isinstance(value, Path) or (isinstance(value, str) and value.endswith((".yml", ".yaml"))):
+    if isinstance(value, Path) or (isinstance(value, str) and value.lower().endswith((".yml", ".yaml"))):
+        loss = read_yaml(value)
         try:
-            return resolve(yaml.safe_load(Path(value).read_text(encoding="utf-8")))
-        except (OSError, ValueError, yaml.YAMLError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            raise ValueError(f"{value}: {reason}") from None
+            return resolve(loss)
+        except ValueError as error:
+            raise ValueError(f"{value}: {error}") from None
     if isinstance(value, Mapping):
         return resolve(value["aux_loss"]) if value.keys() == {"aux_loss"} else AuxLoss.from_dict(value)
     if not isinstance(value, str):

@@ -28,9 +28,9 @@ from importlib.resources import files
 from typing import Any
 
 import gymnasium as gym
-import yaml
 
 from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env  # first: it chooses the renderer
+from sb3_aarl.files import ConfigError, read_yaml
 from sb3_aarl.sac_aux import SACAux
 
 # Functions in RL-Zoo's modules, each of its own name; the others are scripts. push_to_hub is missing: RL-Zoo 2.9.2's fails for
@@ -89,15 +89,16 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     if path is None or not path.endswith((".yml", ".yaml")):
         return list(arguments)
     try:
-        with open(path, encoding="utf-8") as file:
-            entries = yaml.safe_load(file)
-        env_kwargs = dict(entries.get(known.env, entries.get("default", {})).get("env_kwargs", {}))
-    except (OSError, yaml.YAMLError, AttributeError) as error:
-        parser.error(f"{path} is no file of hyper-parameters: {error}")
+        entries = read_yaml(path)
+    except ConfigError as error:
+        parser.error(str(error))
+    entry = entries.get(known.env, entries.get("default", {}))
+    if not isinstance(entry, dict):
+        parser.error(f"{path}: {known.env if known.env in entries else 'default'} must be a mapping, not {entry!r}")
+    env_kwargs = {} if entry.get("env_kwargs") is None else entry["env_kwargs"]
     # RL-Zoo evaluates all behind the colon as Python.
-    for key, value in env_kwargs.items():
-        if not str(key).isidentifier():
-            parser.error(f"{path}: env_kwargs are arguments of an environment, not {key!r}: {value!r}")
+    if not isinstance(env_kwargs, dict) or not all(str(key).isidentifier() for key in env_kwargs):
+        parser.error(f"{path}: env_kwargs must be a mapping from arguments of the environment to values, not {env_kwargs!r}")
     values = [f"{key}:{value!r}" for key, value in env_kwargs.items()]
     return [*arguments, "--env-kwargs", *values, *known.env_kwargs] if values else list(arguments)
 

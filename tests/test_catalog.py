@@ -95,7 +95,7 @@ def test_capitals_and_published_candidates() -> None:
 
 def test_a_file_of_one_loss(tmp_path: Path) -> None:
     path = tmp_path / "winner.yml"
-    for text, problem in (("a: 1", "'a'"), ("aux_loss: curll", "curl"), ("aux_loss: 3", "not 3"), ("{", "flow node")):
+    for text, problem in (("a: 1", "'a'"), ("aux_loss: curll", "curl"), ("aux_loss: 3", "not 3"), ("{", "line [12]")):
         path.write_text(text)
         with pytest.raises(ValueError, match=rf"(?s)winner.yml: .*{problem}"):
             catalog.resolve(path)

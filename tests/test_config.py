@@ -441,6 +441,9 @@ def test_an_environment_without_an_entry_is_named(tmp_path: Path) -> None:
         ("", "must hold a mapping"),
         ("- a", "must hold a mapping"),
         ("a: 2020-13-45", "month"),
+        ("a: &x [*x]", "Circular reference"),
+        ("a: &x {b: *x}", "Circular reference"),
+        ("a: " + "[" * 5000, "recursion"),
         ("!!python/object/apply:os.system ['touch {marker}']", "line 1"),
         ("a: !!python/object/apply:subprocess.check_call [[touch, '{marker}']]", "line 1"),
         ("a: !!python/name:os.system", "line 1"),
@@ -453,8 +456,9 @@ def test_files_that_are_not_plain_are_refused_and_evaluate_nothing(tmp_path: Pat
     if problem is None:
         assert read_yaml(path)
         return
-    with pytest.raises(ConfigError, match=f"file.yml: .*{problem}") as error:
-        read_yaml(path)
+    for read in (read_yaml, catalog.resolve):
+        with pytest.raises(ConfigError, match=f"file.yml: .*{problem}") as error:
+            read(path)
     assert "\n" not in str(error.value)
     assert not marker.exists()
 

@@ -1,6 +1,7 @@
 """RL-Zoo's own programs with SACAux and our files of hyper-parameters."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -190,7 +191,7 @@ def test_what_rl_zoo_would_evaluate_is_refused(key: str, tmp_path: Path, capsys:
     (tmp_path / "own.yml").write_text(f'default: {{env_kwargs: {{"{key}": 1}}}}')
     with pytest.raises(SystemExit):
         with_env_kwargs([*SAC_AUX, "-conf", str(tmp_path / "own.yml")])
-    assert "env_kwargs are arguments of an environment, not" in capsys.readouterr().err
+    assert "env_kwargs must be a mapping from arguments of the environment to values, not" in capsys.readouterr().err
 
 
 def test_plain_values_reach_rl_zoo_as_they_are(tmp_path: Path) -> None:
@@ -200,14 +201,40 @@ def test_plain_values_reach_rl_zoo_as_they_are(tmp_path: Path) -> None:
     assert added(arguments) == {"a": 1, "b": [1, -2.5, None], "c": {"d": True}, "e": "x: __import__(1)#", "f": "'quoted'"}
 
 
-def test_one_error_for_a_file_that_is_missing_or_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "list.yml").write_text("[1, 2]")
-    (tmp_path / "torn.yml").write_text("{a: b")
-    (tmp_path / "object.yml").write_text("!!python/object/apply:os.getcwd []")
-    for name in ("no.yml", "list.yml", "torn.yml", "object.yml"):
-        with pytest.raises(SystemExit):
-            with_env_kwargs([*SAC_AUX, "-conf", str(tmp_path / name)])
-        assert f"error: {tmp_path / name} is no file of hyper-parameters" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "cannot be read: No such file"),
+        (b"[1, 2]", "must hold a mapping"),
+        (b"", "must hold a mapping"),
+        (b"{a: b", "line 1"),
+        (b"!!python/object/apply:os.getcwd []", "line 1"),
+        (b"# r\xe9glages\ndefault: {}", "utf-8"),
+        (b"default: 3", "default must be a mapping, not 3"),
+        (b"default: {env_kwargs: [g]}", "env_kwargs must be a mapping"),
+        (b"default: {env_kwargs: 0}", "env_kwargs must be a mapping"),
+        (b"default: {env_kwargs: 'dict(g=1)'}", "env_kwargs must be a mapping"),
+        (b"default: {env_kwargs: {g: 1, g: 2}}", "line 1: 'g' is there twice"),
+    ],
+)
+def test_one_error_for_a_file_that_cannot_be_used(
+    content: bytes | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "own.yml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SystemExit):
+        with_env_kwargs([*SAC_AUX, "-conf", str(path)])
+    assert re.search(rf"error: {path}: .*{message}", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    "text", ["default: {env_kwargs: }", f"{TASK}: {{env_kwargs: null}}", "default: {batch_size: 8}", "a: {}"]
+)
+def test_no_arguments_of_the_environment(text: str, tmp_path: Path) -> None:
+    (tmp_path / "own.yml").write_text(text)
+    arguments = [*SAC_AUX, "-conf", str(tmp_path / "own.yml")]
+    assert with_env_kwargs(arguments) == arguments
 
 
 def test_a_file_is_not_needed() -> None:

@@ -82,7 +82,7 @@ def search_folder(folder: Path | None, storage: str | None) -> Path | None:
 
     if folder is not None:
         named = run_folder(folder, None)
-        is_config = folder.suffix in (".yml", ".yaml") or (not folder.exists() and named.exists())
+        is_config = folder.suffix.lower() in (".yml", ".yaml") or (not folder.exists() and named.exists())
         return named if is_config else folder
     if storage is not None:
         return None

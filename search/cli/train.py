@@ -169,7 +169,7 @@ def video(
     returns = play(model, env, episodes, seed, imports, frames)
     path.parent.mkdir(parents=True, exist_ok=True)
     # GIF counts in milliseconds, and repeats.
-    imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix == ".gif" else {"fps": FPS}))
+    imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix.lower() == ".gif" else {"fps": FPS}))
     say(f"Video: {path}, {len(frames)} pictures, returns {', '.join(f'{value:.1f}' for value in returns)}")
 
 

@@ -14,8 +14,9 @@ from sb3_aarl.search.execution.runs import Executor, Submission
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
 from sb3_aarl.search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run
 
-from sb3_aarl.callbacks import Evaluation, aulc, replace_text
+from sb3_aarl.callbacks import Evaluation, aulc
 from sb3_aarl.envs import PREFIX
+from sb3_aarl.files import replace_text
 
 POLL_SECONDS = 0.5
 

@@ -19,7 +19,7 @@ from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.search import stored_settings
 from sb3_aarl.search.training.provenance import provenance
 
-from sb3_aarl.callbacks import replace_text
+from sb3_aarl.files import replace_text
 
 N_BEST = 10
 

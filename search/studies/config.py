@@ -161,7 +161,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     def _losses(cls, value: Any, info: ValidationInfo) -> tuple[AuxLoss, ...]:
         if isinstance(value, list | tuple):
             return tuple(loss for item in value for loss in cls._losses(item, info))
-        if isinstance(value, str) and value.endswith((".yml", ".yaml")):
+        if isinstance(value, str) and value.lower().endswith((".yml", ".yaml")):
             return (catalog.resolve(info.data["path"].parent / value),)
         if value == "published":
             losses = [candidate.loss for candidate in catalog.published()]

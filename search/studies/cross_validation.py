@@ -19,7 +19,7 @@ from sb3_aarl.search.training.run import Run
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
-from sb3_aarl.callbacks import replace_text
+from sb3_aarl.files import replace_text
 
 logger = logging.getLogger(__name__)
 

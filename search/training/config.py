@@ -14,7 +14,6 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import gymnasium as gym
-import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveInt, ValidationError, create_model
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
@@ -25,6 +24,7 @@ from sb3_aarl import SACAux, catalog
 from sb3_aarl.buffers import WindowReplayBuffer
 from sb3_aarl.encoders import ENCODERS, encoder_class
 from sb3_aarl.envs import NEEDS_DMC, PREFIX, env_ids, make_dmc_env, wrap_env
+from sb3_aarl.files import ConfigError, read_yaml
 from sb3_aarl.policies import SACAuxPolicy
 
 # How several environments run, under the names of RL-Zoo's option --vec-env.
@@ -51,10 +51,6 @@ WRAPPERS = {
 _WRAPPER_MODULES = {name: module for module, names in WRAPPERS.items() for name in names}
 
 Model = TypeVar("Model", bound=BaseModel)
-
-
-class ConfigError(ValueError):
-    """A configuration cannot be used: one line for each problem, with the file, the key and what is wrong with it."""
 
 
 def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
@@ -188,42 +184,6 @@ def merge(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any
         old = merged.get(key)
         merged[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
     return merged
-
-
-class _Loader(yaml.SafeLoader):
-    """Also reads ``1e-3`` as a number, which is text in YAML 1.1, ``1e5`` as an integer; refuses a key that is there twice."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.value != "<<"]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"{key!r} is there twice", node.start_mark)
-        return super().construct_mapping(node, deep)
-
-    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
-        number = super().construct_yaml_float(node)
-        return int(number) if number.is_integer() else number
-
-
-_FLOAT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
-_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
-
-
-def read_yaml(path: str | Path) -> dict[str, Any]:
-    """The mapping in a YAML file. Nothing in it is evaluated."""
-    try:
-        values = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except yaml.MarkedYAMLError as error:
-        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        raise ConfigError(f"{path}: {line}{error.problem}") from None
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or no date, such as 2020-13-45
-        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: must hold a mapping, not {values!r}")
-    return values
 
 
 def validated(model_class: type[Model], values: Mapping[str, Any], source: str) -> Model:

@@ -18,7 +18,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_aarl.callbacks import replace_text
+from sb3_aarl.files import replace_text
 
 ABOUT = "provenance.json"
 PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "shimmy", "optuna", "numpy")

@@ -38,8 +38,9 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_aarl import AuxLoss, SACAux
-from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, read_curve, replace_text, write_curve
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, read_curve, write_curve
 from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
+from sb3_aarl.files import replace_text
 
 logger = logging.getLogger(__name__)
 
