@@ -171,8 +171,12 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(name: str, monke
         ("Pendulum-v1", "--ray-address auto", "--ray-address needs --executor ray"),
         ("CartPole-v1", "", "CartPole-v1 cannot be trained"),
         ("Pendulum-v1\nstages: 3", "", "small.yml: stages"),
+        ("Pendulum-v1\noverrides: {train_freq: 0}", "", "small.yml: Pendulum-v1 cannot be trained"),
+        ("Pendulum-v1\noverrides: {train_freq: [1, episode], n_envs: 2}", "", "small.yml: Pendulum-v1 cannot be trained"),
+        ("Pendulum-v1\noverrides: {stats_window_size: -1}", "--dry-run", "small.yml: Pendulum-v1 cannot be trained"),
+        ("Pendulum-v1\noverrides: {policy_kwargs: {n_critics: 0}}", "", "small.yml: Pendulum-v1 cannot be trained"),
     ],
-    ids=["cpus", "address", "actions", "key"],
+    ids=str,
 )
 def test_what_cannot_be_searched_is_refused_before_anything_is_made(
     environment: str, options: str, message: str, folder: Path
@@ -317,6 +321,14 @@ def test_baselines_and_operators(folder: Path, executor: Planted) -> None:
     output = run("select-operator", "small.yml")
     first = next(line for line in output.splitlines() if "negative samples" in line)
     assert "mse, w/o negative samples" in first and "1.000" in first and output.count("negative samples") == 10
+
+
+def test_baselines_and_other_environments_are_tried_out(folder: Path, executor: Planted, searched: optuna.Study) -> None:
+    text = SEARCH + "baselines:\n- {name: a}\n- {name: b, overrides: {policy_kwargs: {n_critics: 0}}}\n"
+    write_search(folder, text + "cross_validation: {environments: [Pendulum-v1, CartPole-v1], seeds: [1]}\n")
+    assert "small.yml: Pendulum-v1 cannot be trained" in run("baselines", "small.yml", code=2)
+    assert "small.yml: CartPole-v1 cannot be trained" in run("cross-validate", "small.yml", code=2)
+    assert not executor.runs
 
 
 def test_a_benchmark_grows_and_names_what_failed(folder: Path, executor: Planted) -> None:

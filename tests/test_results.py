@@ -46,7 +46,7 @@ SCORE = "{mean:.0f} ± {std:.0f}"
 def in_repository(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands name files of the repository; that their models can be made is not tested here."""
     monkeypatch.chdir(RESULTS.parent)
-    monkeypatch.setattr(benchmark, "check_run", lambda run: None)
+    monkeypatch.setattr(benchmark, "check_run", lambda run, source: None)
 
 
 def abouts_of(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, Any]]:

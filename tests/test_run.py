@@ -388,13 +388,29 @@ def test_environments_in_processes_are_the_same(tmp_path: Path) -> None:
         ({"hyperparameters": DENSE | {"train_freq": 3, "n_envs": 2}}, r"checkpoints .* multiples of 6 .*\[32, 64\] are not"),
         ({"hyperparameters": DENSE | {"env_kwargs": {"action_repeat": 5}}}, r"checkpoints .* multiples of 5 .*\[32, 64\]"),
         ({"hyperparameters": DENSE | {"train_freq": [2, "episode"]}}, "train_freq"),
+        ({"hyperparameters": DENSE | {"train_freq": [1, "episode"], "n_envs": 2}}, "only one env"),
+        ({"hyperparameters": DENSE | {"train_freq": -20}}, "Walk-v0 cannot be trained .*at least collect one step"),
+        ({"hyperparameters": DENSE | {"policy_kwargs": {"n_critics": 0}}}, "Walk-v0 cannot be trained with these settings"),
+        ({"hyperparameters": DENSE | {"stats_window_size": -1}}, "Walk-v0 cannot be trained .*non-negative"),
+        ({"hyperparameters": DENSE | {"policy_kwargs": {"net_arch": [-3]}}}, "Walk-v0 cannot be trained"),
     ],
-    ids=["discrete", "unknown", "shape", "horizon", "import", "value", "key", "rollout", "repeat", "episodes"],
+    ids=str,
 )
 def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as error:
-        check_run(make_run(**changes))
+        check_run(make_run(**changes), "own.yml")
+    assert str(error.value).startswith("own.yml: ") or "imports" in changes
     assert "\n" not in str(error.value)
+
+
+def test_a_run_is_tried_out_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for train_freq in (1, (1, "episode"), 32):
+        check_run(make_run(hyperparameters=DENSE | {"tensorboard_log": "logs", "train_freq": train_freq}), "own.yml")
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr("stable_baselines3.common.utils.SummaryWriter", None)  # without tensorboard
+    with pytest.raises(ConfigError, match=r"own.yml: Walk-v0 cannot be trained .*tensorboard"):
+        check_run(make_run(hyperparameters=DENSE | {"tensorboard_log": "logs"}), "own.yml")
 
 
 @pytest.mark.parametrize(
@@ -403,7 +419,7 @@ def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None
 def test_evaluations_closer_than_an_episode(
     checkpoints: tuple[int, ...], n_envs: int, n_warnings: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    check_run(make_run(checkpoints=checkpoints, hyperparameters=DENSE | {"n_envs": n_envs}))
+    check_run(make_run(checkpoints=checkpoints, hyperparameters=DENSE | {"n_envs": n_envs}), "own.yml")
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(warnings) == n_warnings and all("truncate" in warning for warning in warnings)
 
@@ -417,8 +433,8 @@ def test_short_runs_are_not_compiled(steps: int, compiled: bool) -> None:
 
 
 def test_a_run_too_short_to_learn_is_said_before_it_starts(caplog: pytest.LogCaptureFixture) -> None:
-    check_run(make_run(hyperparameters=DENSE | {"learning_starts": 64}))
-    check_run(make_run(hyperparameters=DENSE | {"learning_starts": 63}))
+    check_run(make_run(hyperparameters=DENSE | {"learning_starts": 64}), "own.yml")
+    check_run(make_run(hyperparameters=DENSE | {"learning_starts": 63}), "own.yml")
     assert [record.getMessage() for record in caplog.records] == [
         "64 agent steps are all random actions, nothing is learnt: learning_starts is 64"
     ]

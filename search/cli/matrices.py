@@ -19,11 +19,13 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-def train_matrix(matrix: "Matrix", workers: int, retries: int = 3) -> None:
-    """Train the runs of a matrix that are not finished, and show the progress."""
-    from sb3_aarl.search.execution.matrix import run_matrix
+def train_matrix(matrix: "Matrix", workers: int, retries: int = 3, config: Path | None = None) -> None:
+    """Train the runs of a matrix that are not finished, which are tried out if they are of a search, and show the progress."""
+    from sb3_aarl.search.execution.matrix import check_matrix, run_matrix
     from sb3_aarl.search.execution.runs import LocalExecutor
 
+    if config is not None:
+        check_matrix(matrix, str(config))
     with LocalExecutor(workers) as executor, live() as show:
         for progress in run_matrix(matrix, executor, workers, retries):
             counts = f"{progress.finished}/{progress.total} runs, {progress.failed} failed"
@@ -88,7 +90,7 @@ def baselines(
     if (path / STUDY_FILE).exists():
         search.check_study(load_study(open_storage(path), settings.name), settings, free=("threads",))
     matrix = search.baselines(settings, path)
-    train_matrix(matrix, workers, settings.retries)
+    train_matrix(matrix, workers, settings.retries, config)
     compare(matrix, ranking, "Baselines, AULC", json)
     exit_if_failed(matrix)
 
@@ -102,7 +104,7 @@ def select_operator(
 
     settings = read_config(config, threads=threads)
     matrix = operator_selection.make_matrix(settings, run_folder(config, folder))
-    train_matrix(matrix, workers, settings.retries)
+    train_matrix(matrix, workers, settings.retries, config)
     compare(matrix, operator_selection.table, "Normalized returns at the last checkpoint (paper, table 2)", json)
     exit_if_failed(matrix)
 
@@ -128,7 +130,7 @@ def cross_validate(
     path = run_folder(config, folder)
     searched = load_study(open_storage(path, storage, create=False), settings.name)
     matrix = cross_validation.make_matrix(settings, searched, path, top, settings.baselines if with_baselines else ())
-    train_matrix(matrix, workers, settings.retries)
+    train_matrix(matrix, workers, settings.retries, config)
     table = compare(matrix, cross_validation.ranking, "Cross-validation, AULC", json)
     names = [baseline.name for baseline in settings.baselines]
     if table is not None and not (candidates := table.drop(index=names, errors="ignore")).empty:

@@ -63,8 +63,11 @@ def read_config(path: Path, **changes: Any) -> "SearchConfig":
     from sb3_aarl.search.studies.search import make_run
     from sb3_aarl.search.training.run import check_run
 
+    from sb3_aarl import catalog
+
     config = load_config(path).model_copy(update={key: value for key, value in changes.items() if value is not None})
-    setup = check_run(make_run(config, config.environment, None, config.seeds[0]))
+    run = make_run(config, config.environment, catalog.load("forward-dynamics"), config.seeds[0])
+    setup = check_run(run, str(path))
     if setup.episode_steps is not None and setup.episode_steps < (horizon := config.max_horizon * setup.action_repeat):
         message = "max_horizon is %d environment steps, episodes have %d: losses of longer horizons are never trained"
         logger.warning(message, horizon, setup.episode_steps)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 from sb3_aarl.search.execution.runs import Executor, Submission
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
-from sb3_aarl.search.training.run import FAILED, Run, is_finished, partial_curve, prepare_run
+from sb3_aarl.search.training.run import FAILED, Run, check_run, is_finished, partial_curve, prepare_run
 
 from sb3_aarl.callbacks import Evaluation, aulc
 from sb3_aarl.envs import PREFIX
@@ -63,6 +63,21 @@ def cell_folder(folder: Path, cell: Cell) -> Path:
         slug = re.sub(r"[^a-z0-9]+", "-", variant.lower()).strip("-")[:60]
         variant = f"{slug}-{hashlib.sha256(variant.encode()).hexdigest()[:8]}"
     return folder / variant / task_name(cell.environment).replace("/", "_") / f"seed-{cell.seed}"
+
+
+def check_matrix(matrix: Matrix, source: str) -> None:
+    """
+    Try out one of the runs that have the same hyper-parameters and environment, unless it is finished.
+
+    :raises ConfigError: naming the source of the settings, when one of them cannot be trained
+    """
+    kinds = {
+        (run.environment, json.dumps(run.hyperparameters)): run
+        for cell, run in matrix.runs.items()
+        if not is_finished(cell_folder(matrix.folder, cell))
+    }
+    for run in kinds.values():
+        check_run(run, source)
 
 
 def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: int = 3) -> Iterator[MatrixProgress]:

@@ -192,4 +192,4 @@ def _check_models(matrix: Matrix) -> None:
         what = cell.variant if cell.environment.startswith(PREFIX) else cell[:2]
         if what not in checked:
             checked.add(what)
-            check_run(run)
+            check_run(run, matrix.abouts[cell]["file"])

@@ -78,7 +78,7 @@ def prepare_one(
     folder = Path(folder)
     if (folder / "study.db").exists():  # sb3_aarl.search.execution.storage, which has the name, needs Optuna
         raise ValueError(f"{folder} is the folder of a search: choose another folder (--folder)")
-    check_run(run)
+    check_run(run, str(file))
     prepare_run(folder, run)
     return folder
 

@@ -13,10 +13,10 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
 import pydantic
 import torch as th
 from filelock import FileLock, Timeout
@@ -61,6 +61,8 @@ FIXED = {"training": False, "norm_reward": False}
 # Agent steps of the shortest run that is compiled: it takes two minutes, and saves at most 15 ms of a gradient step, from
 # pixels (benchmarks/README.md).
 COMPILED_STEPS = 8_000
+# Agent steps of a run that is tried out: so that there are windows.
+TRIED_STEPS = 20
 # Hyper-parameters that do not change what is trained: the checkpoints say how long, and any device will do.
 FREE = ("n_timesteps", "device")
 
@@ -176,7 +178,7 @@ def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
     """Environment steps of one rollout with these hyper-parameters: every checkpoint is a multiple of them."""
     train_freq = hyperparameters.get("train_freq", 1)
     rollout = train_freq if isinstance(train_freq, int) else 1 if train_freq[1] == "episode" else train_freq[0]
-    return rollout * hyperparameters.get("n_envs", 1) * action_repeat(hyperparameters)
+    return max(1, rollout) * hyperparameters.get("n_envs", 1) * action_repeat(hyperparameters)
 
 
 def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, Any], source: str) -> None:
@@ -269,23 +271,33 @@ class Setup:
         return SACAux(self.policy or fitting, env, **self.settings)
 
 
-def check_run(run: Run) -> Setup:
-    """Make environment and model of a run once, and make a step; warn of what a user may not have meant. Return its setup."""
+def check_run(run: Run, source: str | None = None) -> Setup:
+    """
+    Try a run out, before it is submitted: make its environment and model, train for some steps. Warn of what a user may not
+    have meant.
+
+    :param run: The run
+    :param source: The file with its settings, for messages; None for the environment alone
+    :return: What it is trained with
+    :raises ConfigError: with the reason in one line, when it cannot be trained
+    """
+    what = f"{source or ''}: {run.environment} cannot be trained with these settings".removeprefix(": ")
     try:
-        setup = Setup(run, run.environment)
-        with closing(setup.training_env()) as env:
+        setup = Setup(run, source or run.environment)
+        setup.settings["compile"] = False  # it takes minutes
+        with closing(setup.training_env()) as env, TemporaryDirectory() as folder:
             model = setup.model(env)
             learning_starts = model.learning_starts
-            env.reset()
-            env.step(np.stack([env.action_space.sample() for _ in range(env.num_envs)]))
+            model.tensorboard_log = None if model.tensorboard_log is None else folder
+            try_out(model)
     except ConfigError:
         raise
     except Exception as error:  # Gymnasium, SB3 and PyTorch have errors of all kinds
-        raise ConfigError(f"{run.environment} cannot be trained with these settings: {_one_line(error)}") from error
+        raise ConfigError(f"{what}: {_one_line(error)}") from error
     horizon = model.aux_loss.horizon * setup.action_repeat if isinstance(model.aux_loss, AuxLoss) else 0
     if setup.episode_steps is not None and setup.episode_steps < horizon:
         problem = f"have {setup.episode_steps} environment steps, the horizon of {model.aux_loss} {horizon}"
-        raise ConfigError(f"{run.environment} cannot be trained with these settings: episodes {problem}")
+        raise ConfigError(f"{what}: episodes {problem}")
     if setup.agent_steps <= learning_starts:
         message = "%d agent steps are all random actions, nothing is learnt: learning_starts is %d"
         logger.warning(message, setup.agent_steps, learning_starts)
@@ -296,6 +308,19 @@ def check_run(run: Run) -> Setup:
         message = "evaluating every %d environment steps truncates episodes, which may have %d"
         logger.warning(message, apart // setup.n_envs, setup.episode_steps)
     return setup
+
+
+def try_out(model: SACAux) -> None:
+    """Make some steps with a model, with its own actions, and gradient steps of all its parts."""
+
+    def step(*_: Any) -> bool:
+        if model.num_timesteps < TRIED_STEPS * model.n_envs:
+            return True
+        model.train(2, model.batch_size)  # the actor is not trained at each
+        return False  # whatever the length of a rollout is
+
+    model.verbose = model.learning_starts = 0
+    model.learn(TRIED_STEPS * model.n_envs, step)
 
 
 def _one_line(error: BaseException) -> str:
