@@ -344,7 +344,7 @@ def test_learning_rates_that_fall(tmp_path: Path) -> None:
 
 
 def test_wrappers_are_in_training_and_evaluation(tmp_path: Path) -> None:
-    wrappers = ["ClipAction", {"gymnasium.wrappers.time_limit.TimeLimit": {"max_episode_steps": 8}}]
+    wrappers = ["gymnasium.wrappers.ClipAction", {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 8}}]
     setup = module.Setup(make_run(hyperparameters=DENSE | {"env_wrapper": wrappers}), "here")
     assert setup.episode_steps == 8
     for env in (setup.training_env(), setup.evaluation_env()):
@@ -393,6 +393,17 @@ def test_environments_in_processes_are_the_same(tmp_path: Path) -> None:
         ({"hyperparameters": DENSE | {"policy_kwargs": {"n_critics": 0}}}, "Walk-v0 cannot be trained with these settings"),
         ({"hyperparameters": DENSE | {"stats_window_size": -1}}, "Walk-v0 cannot be trained .*non-negative"),
         ({"hyperparameters": DENSE | {"policy_kwargs": {"net_arch": [-3]}}}, "Walk-v0 cannot be trained"),
+        ({"hyperparameters": DENSE | {"policy_kwargs": {"net_arc": [3]}}}, "Walk-v0 cannot be trained .*net_arc"),
+        (
+            {"hyperparameters": DENSE | {"policy_kwargs": {"optimizer_kwargs": {"epss": 1}}}},
+            "Walk-v0 cannot be trained .*epss",
+        ),
+        (
+            {"hyperparameters": DENSE | {"policy_kwargs": {"features_extractor_class": "dens"}}},
+            "Walk-v0 cannot be .*dense_mlp",
+        ),
+        ({"hyperparameters": DENSE | {"replay_buffer_kwargs": {"frame": 2}}}, "Walk-v0 cannot be trained .*frame"),
+        ({"hyperparameters": DENSE | {"normalize": {"norm_obz": True}}}, "Walk-v0 cannot be trained .*norm_obz"),
     ],
     ids=str,
 )

@@ -61,7 +61,7 @@ COMMON: dict[str, Any] = {
     "ent_coef": "auto_0.1",
     "policy_delay": 2,
 }
-ADAM = {"net_arch": [1024, 1024], "optimizer_kwargs": {"betas": (0.9, 0.999)}}
+ADAM = {"net_arch": [1024, 1024], "optimizer_kwargs": {"betas": [0.9, 0.999]}}
 # How the public code starts actor and critic.
 PUBLIC_START = {"ortho_init": True, "squash_log_std": (-10, 2)}
 

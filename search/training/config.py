@@ -1,12 +1,10 @@
 """Hyper-parameters of a run: plain YAML, read with a safe loader, checked before anything runs."""
 
-import ast
 import difflib
 import functools
 import importlib
 import inspect
 import json
-import re
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
@@ -14,41 +12,16 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import gymnasium as gym
-from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveInt, ValidationError, create_model
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError, create_model
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
-from stable_baselines3.sac.policies import SACPolicy
-from torch.optim import Adam
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_aarl import SACAux, catalog
-from sb3_aarl.buffers import WindowReplayBuffer
-from sb3_aarl.encoders import ENCODERS, encoder_class
 from sb3_aarl.envs import NEEDS_DMC, PREFIX, env_ids, make_dmc_env, wrap_env
 from sb3_aarl.files import ConfigError, read_yaml
-from sb3_aarl.policies import SACAuxPolicy
 
 # How several environments run, under the names of RL-Zoo's option --vec-env.
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
-
-# RL-Zoo's keys that are no arguments of a run, and why.
-_OF_RL_ZOO = "python -m sb3_aarl.rl_zoo train has it, aarl has not"
-REFUSED = {
-    "replay_buffer_class": "a run has a WindowReplayBuffer; in Python, SACAux takes HerReplayBuffer with aux_loss=None",
-    "frame_stack": "write env_kwargs: {frame_stack: 4}",
-} | dict.fromkeys(("callback", "monitor_kwargs", "noise_std", "noise_type", "vec_env_wrapper"), _OF_RL_ZOO)
-# What `env_wrapper` may name, and where it is imported from: no text of a user is.
-WRAPPERS = {
-    "gymnasium.wrappers": (
-        *("ClipAction", "ClipReward", "FlattenObservation", "RescaleAction", "RescaleObservation", "TimeAwareObservation"),
-        "TimeLimit",
-    ),
-    "rl_zoo3.wrappers": (
-        *("ActionNoiseWrapper", "ActionSmoothingWrapper", "DelayedRewardWrapper", "HistoryWrapper", "MaskVelocityWrapper"),
-        "TruncatedOnSuccessWrapper",
-    ),
-    "sb3_contrib.common.wrappers": ("TimeFeatureWrapper",),
-}
-_WRAPPER_MODULES = {name: module for module, names in WRAPPERS.items() for name in names}
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -56,85 +29,60 @@ Model = TypeVar("Model", bound=BaseModel)
 def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     """
     Read the hyper-parameters of an environment from a file like RL-Zoo's: a mapping from environment id to arguments of
-    SACAux, ``policy``, ``n_timesteps`` (agent steps), ``n_envs`` (environments that are trained on at once),
-    ``env_kwargs`` (of ``make_dmc_env``, or of ``wrap_env`` for what is not DeepMind Control), ``env_wrapper`` (names of
-    ``WRAPPERS``, or mappings from a name to its arguments) and ``normalize`` (true, or arguments of ``VecNormalize``). The
-    environment's own entry is merged over the entry ``default``.
+    SACAux, ``n_timesteps`` (agent steps), ``n_envs`` (environments that are trained on at once), ``env_kwargs`` (of
+    ``make_dmc_env``, or of ``wrap_env`` for what is not DeepMind Control), ``env_wrapper`` (as for :func:`env_wrappers`) and
+    ``normalize`` (true, or arguments of ``VecNormalize``). The environment's own entry is merged over the entry ``default``.
 
     As in RL-Zoo, ``n_envs`` alone makes fewer updates; ``gradient_steps: -1`` keeps one for each transition. ``vec_env`` is
     ``dummy`` (all in one process) or ``subproc`` (each in its own, faster where there are cores for them, and equal
-    otherwise); RL-Zoo has it on the command line.
-
-    Nothing in the file is evaluated. A learning rate may be ``lin_3e-4``, which falls to 0, and arguments may be text with
-    plain values: ``"dict(net_arch=[64, 64])"``.
+    otherwise). A learning rate may be ``lin_3e-4``, which falls to 0. Nothing in the file is evaluated.
 
     :raises ConfigError: naming the file and the key that is wrong
     """
-    entries = read_yaml(path)
+    return entry_of(read_yaml(path), env_id, str(path))
+
+
+def entry_of(entries: Mapping[str, Any], env_id: str, source: str) -> dict[str, Any]:
+    """The hyper-parameters of an environment in what a file of them has."""
     if not {"default", env_id} & entries.keys():
-        hint = ": it is the file of a search" if "environment" in entries else ", under which hyper-parameters stand"
-        raise ConfigError(f"{path}: neither {env_id!r} nor 'default' is there{hint}")
+        hint = ": it is the file of a search" if "environment" in entries else ", under which hyper-parameters are expected"
+        raise ConfigError(f"{source}: neither {env_id!r} nor 'default' is there{hint}")
     merged: dict[str, Any] = {}
     for name in ("default", env_id):
         entry = entries.get(name, {})
         if not isinstance(entry, dict):
-            raise ConfigError(f"{path}: {name} must be a mapping, not {entry!r}")
-        merged = merge(merged, _read_texts(entry, str(path)))
-    return check_hyperparameters(merged, env_id, str(path))
+            raise ConfigError(f"{source}: {name} must be a mapping, not {entry!r}")
+        merged = merge(merged, entry)
+    return check_hyperparameters(merged, env_id, source)
 
 
 def check_hyperparameters(values: Mapping[str, Any], env_id: str, source: str) -> dict[str, Any]:
-    """Hyper-parameters with the types of the arguments that they are: lists are tuples where an argument is one."""
-    refused = [f"{source}: {key}: {reason}" for key, reason in REFUSED.items() if key in values]
-    if refused:
-        raise ConfigError("\n".join(refused))
-    values = _read_texts(values, source)
-    parts = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    pixels = parts.get("env_kwargs", {}).get("pixels")
-    policy = values.get("policy", "CnnPolicy" if pixels else "MlpPolicy")
-    encoder = parts.get("policy_kwargs", {}).get("features_extractor_class")
-    model = _hyperparameters_model(env_id.startswith(PREFIX), str(policy), str(encoder), "normalize" in parts)
+    """
+    Hyper-parameters with the types of SACAux's arguments: lists are tuples where an argument is one. What is in their mappings
+    is checked where a model is made, unless it is of the environment.
+    """
+    model = _hyperparameters_model(env_id.startswith(PREFIX))
     return validated(model, values, source).model_dump(exclude_unset=True)
 
 
-def _read_texts(values: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Values with RL-Zoo's texts, such as ``"dict(norm_obs=True)"``, as the mappings that they stand for."""
-    read = dict(values)
-    for key in ("normalize", "policy_kwargs", "replay_buffer_kwargs"):
-        if isinstance(values.get(key), str):
-            try:
-                # As plain values through JSON, which refuses bytes, sets and so on.
-                read[key] = json.loads(json.dumps(_read_text(ast.parse(values[key].strip(), mode="eval").body)))
-            except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError):
-                raise ConfigError(f"{source}: {key}: must be a mapping of plain values, not {values[key]!r}") from None
-    return read
-
-
-def _read_text(node: ast.expr) -> Any:
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "dict" and not node.args:
-        return {keyword.arg: _read_text(keyword.value) for keyword in node.keywords}
-    return ast.literal_eval(node)
-
-
-def env_wrappers(value: Any) -> list[tuple[str, str, dict[str, Any]]]:
+def env_wrappers(value: Any) -> list[tuple[type[gym.Wrapper], dict[str, Any]]]:
     """
-    Module, name and arguments of each wrapper of ``env_wrapper``, the innermost first: a name, with dots before it as in
-    RL-Zoo's files or without, a mapping from one name to arguments, or a list of both.
+    Class and arguments of each wrapper of ``env_wrapper``, the innermost first: a name such as
+    ``gymnasium.wrappers.ClipAction``, a mapping from one name to arguments, or a list of both.
     """
     found = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:
-        path, arguments = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, None)
-        package, _, name = str(path).rpartition(".")
-        module = _WRAPPER_MODULES.get(name)
-        # Where RL-Zoo's files have it from may be an older module, such as gymnasium.wrappers.time_limit.
-        packages = {known.partition(".")[0] for known in WRAPPERS} | {""}
-        if module is None or package.partition(".")[0] not in packages:
-            if name == "FrameSkip":
-                raise ValueError(f"write env_kwargs: {{action_repeat: 2}} for {path}, which counts environment steps")
-            raise ValueError(f"{str(path)!r} is none of {', '.join(sorted(_WRAPPER_MODULES))}")
+        name, arguments = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, None)
+        module, _, wrapper = str(name).rpartition(".")
+        try:
+            kind = getattr(importlib.import_module(module), wrapper)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ValueError(f"{name!r} cannot be imported: {error}") from None
+        if not (isinstance(kind, type) and issubclass(kind, gym.Wrapper)):
+            raise ValueError(f"{name!r} is no gymnasium.Wrapper")
         if not isinstance(arguments, Mapping | None):
             raise ValueError(f"{name} must have a mapping of arguments, not {arguments!r}")
-        found.append((module, name, dict(arguments or {})))
+        found.append((kind, dict(arguments or {})))
     return found
 
 
@@ -224,14 +172,14 @@ def _unknown_key(location: Sequence[str | int], model: Any) -> str:
         if isinstance(part, str):
             annotation = model.model_fields[part].annotation
             model = next(kind for kind in (annotation, *get_args(annotation)) if hasattr(kind, "model_fields"))
-    nearest = difflib.get_close_matches(str(location[-1]), model.model_fields, n=1, cutoff=0.0)
-    return f"unknown key, {f'the nearest known is {nearest[0]!r}' if nearest else 'no key is known here'}"
+    nearest = difflib.get_close_matches(str(location[-1]), model.model_fields, n=1)
+    return f"unknown key{f', the nearest known is {nearest[0]!r}' if nearest else ''}"
 
 
 def _plain(annotation: Any) -> Any:
     """The part of an annotation that plain YAML can say: no objects, no functions. None where nothing is left."""
     if annotation == Schedule:
-        return Annotated[str, AfterValidator(_check_schedule)]
+        return Annotated[str, Field(pattern=r"^lin_[0-9]*\.?[0-9]+([eE][-+]?[0-9]+)?$")]
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin in (Union, UnionType):
         members = [member for member in map(_plain, arguments) if member is not None]
@@ -243,10 +191,9 @@ def _plain(annotation: Any) -> Any:
     return annotation if annotation in (int, float, str, bool, dict, NoneType, Any, ...) else None
 
 
-def _arguments(*functions: Callable[..., Any], without: Collection[str] = ()) -> dict[str, Any]:
-    """The arguments of functions that can be plain values, with their types."""
-    parameters = [parameter for function in functions for parameter in inspect.signature(function).parameters.values()]
-    kinds = {item.name: _plain(item.annotation) for item in parameters if item.kind != inspect.Parameter.VAR_KEYWORD}
+def _arguments(function: Callable[..., Any], without: Collection[str]) -> dict[str, Any]:
+    """The arguments of a function that can be plain values, with their types."""
+    kinds = {name: _plain(item.annotation) for name, item in inspect.signature(function).parameters.items()}
     return {name: kind for name, kind in kinds.items() if kind is not None and name not in without}
 
 
@@ -254,12 +201,6 @@ def _model(name: str, kinds: Mapping[str, Any]) -> Any:
     """A model whose keys may all be missing: defaults are those of the functions."""
     fields: Any = {key: (kind, None) for key, kind in kinds.items()}
     return create_model(name, __config__=ConfigDict(extra="forbid", allow_inf_nan=False), **fields)
-
-
-def _check_schedule(value: str) -> str:
-    if not re.fullmatch(r"lin_[0-9]*\.?[0-9]+([eE][-+]?[0-9]+)?", value):
-        raise ValueError(f"a schedule such as 'lin_3e-4', not {value!r}")
-    return value
 
 
 def _check_env_wrapper(value: Any) -> Any:
@@ -274,22 +215,9 @@ def _check_aux_loss(value: Any) -> Any:
 
 
 @functools.cache
-def _hyperparameters_model(is_dmc: bool, policy: str, encoder: str, has_arguments: bool) -> type[BaseModel]:
-    """
-    The model of an environment's hyper-parameters: the arguments of SACAux, its policy and so on. For an encoder that is not
-    known, such as "None", they are those of the policy's own.
-    """
-    policy_class: Any = SACAux.policy_aliases.get(policy, SACAuxPolicy)
-    extractor = encoder_class(encoder if encoder in ENCODERS else policy_class.default_encoder)
-    policy_kwargs = _arguments(SACPolicy, SACAuxPolicy, without=("use_sde", "lr_schedule", "augmentation", "crop_size")) | {
-        "features_extractor_class": Literal[tuple(ENCODERS)] | None,
-        "features_extractor_kwargs": _model("FeaturesExtractorKwargs", _arguments(extractor)) | None,
-        "optimizer_kwargs": _model("OptimizerKwargs", _arguments(Adam, without=("params", "lr"))) | None,
-    }
+def _hyperparameters_model(is_dmc: bool) -> type[BaseModel]:
+    """The model of an environment's hyper-parameters."""
     env_kwargs = _arguments(make_dmc_env if is_dmc else wrap_env, without=("env_id", "env", "seed"))
-    # SACAux passes the others itself.
-    passed = ("buffer_size", "device", "n_envs", "optimize_memory_usage", "n_steps", "gamma")
-    normalize = _model("Normalize", _arguments(VecNormalize, without=("training",)))
     kinds = _arguments(SACAux, without=("env", "seed", "_init_setup_model")) | {
         "policy": Literal[tuple(SACAux.policy_aliases)],
         "aux_loss": Annotated[str | dict[str, Any] | None, AfterValidator(_check_aux_loss)],
@@ -298,8 +226,6 @@ def _hyperparameters_model(is_dmc: bool, policy: str, encoder: str, has_argument
         "vec_env": Literal[tuple(VEC_ENVS)],
         "env_kwargs": _model("EnvKwargs", env_kwargs | {"action_repeat": PositiveInt}) | None,
         "env_wrapper": Annotated[Any, AfterValidator(_check_env_wrapper)],
-        "policy_kwargs": _model("PolicyKwargs", policy_kwargs) | None,
-        "replay_buffer_kwargs": _model("ReplayBufferKwargs", _arguments(WindowReplayBuffer, without=passed)) | None,
-        "normalize": normalize if has_arguments else bool,
+        "normalize": bool | dict[str, Any],
     }
     return _model("Hyperparameters", kinds)

@@ -2,7 +2,6 @@
 
 import argparse
 import functools
-import importlib
 import inspect
 import json
 import logging
@@ -169,8 +168,8 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any = None
     else:
         arguments: dict[str, Any] = {"render_mode": "rgb_array"} if renders or env_kwargs.get("pixels") else {}
         env = wrap_env(gym.make(env_id, **arguments), **env_kwargs)
-    for module, name, wrapper_arguments in env_wrappers(env_wrapper):
-        env = getattr(importlib.import_module(module), name)(env, **wrapper_arguments)
+    for wrapper, wrapper_arguments in env_wrappers(env_wrapper):
+        env = wrapper(env, **wrapper_arguments)
     return env
 
 
@@ -235,15 +234,12 @@ class Setup:
         settings["buffer_size"] = min(settings.get("buffer_size", default), needed)
         if settings.get("compile") and self.agent_steps < COMPILED_STEPS:
             settings["compile"] = False
-        for key, value in settings.items():
-            if key.endswith("learning_rate") and isinstance(value, str):
-                settings[key] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
-        self.settings = settings | {"aux_loss": run.aux_loss, "seed": run.seed}
+        self.settings = _with_schedules(settings) | {"aux_loss": run.aux_loss, "seed": run.seed}
 
         of_dmc = run.environment.startswith(PREFIX)
         limits = [EPISODE_LENGTH if of_dmc else gym.spec(run.environment).max_episode_steps]
-        for _, name, arguments in env_wrappers(self.env_wrapper):
-            limits += [arguments["max_episode_steps"] * self.action_repeat] if name == "TimeLimit" else []
+        for wrapper, arguments in env_wrappers(self.env_wrapper):
+            limits += [arguments["max_episode_steps"] * self.action_repeat] if wrapper is gym.wrappers.TimeLimit else []
         self.episode_steps = min((limit for limit in limits if limit is not None), default=None)
 
     def _make(self, steps: Sequence[int] = ()) -> Callable[[], gym.Env]:
@@ -269,6 +265,17 @@ class Setup:
         if isinstance(env.observation_space, spaces.Dict):
             fitting = "MultiInputPolicy"
         return SACAux(self.policy or fitting, env, **self.settings)
+
+
+def _with_schedules(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings, and those in their mappings, with functions for learning rates such as ``lin_3e-4``."""
+    read: dict[str, Any] = {}
+    for key, value in settings.items():
+        is_schedule = isinstance(value, str) and value.startswith("lin_")
+        read[key] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0) if is_schedule else value
+        if isinstance(value, Mapping):
+            read[key] = _with_schedules(value)
+    return read
 
 
 def check_run(run: Run, source: str | None = None) -> Setup:
