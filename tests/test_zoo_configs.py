@@ -63,7 +63,7 @@ COMMON: dict[str, Any] = {
 }
 ADAM = {"net_arch": [1024, 1024], "optimizer_kwargs": {"betas": [0.9, 0.999]}}
 # How the public code starts actor and critic.
-PUBLIC_START = {"ortho_init": True, "squash_log_std": (-10, 2)}
+PUBLIC_START = {"ortho_init": True, "squash_log_std": [-10, 2]}
 
 
 def with_loss(aux_loss: str | None, auxiliary: dict[str, Any]) -> dict[str, Any]:
