@@ -4,7 +4,8 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from sb3_aarl.search.training.run import Run, read_run, train
+from sb3_aarl.search.training.folder import read_run
+from sb3_aarl.search.training.run import Run, train
 
 from sb3_aarl.callbacks import Evaluation, write_curve
 

@@ -18,8 +18,9 @@ from sb3_aarl.search.studies.benchmark import load_benchmark, parse_seeds, parse
 from sb3_aarl.search.studies.status import matrix_status
 from sb3_aarl.search.training import provenance
 from sb3_aarl.search.training.config import load_hyperparameters
+from sb3_aarl.search.training.folder import read_outcome
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
-from sb3_aarl.search.training.run import prepare_run, read_outcome, train
+from sb3_aarl.search.training.run import prepare_run, train
 from tiny import YAML
 
 from sb3_aarl.callbacks import Evaluation, aulc, read_curve, write_curve

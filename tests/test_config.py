@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig, load_config
 from sb3_aarl.search.training.config import ConfigError, check_hyperparameters, load_hyperparameters, read_yaml, resolve_env_id
-from sb3_aarl.search.training.run import make_env
+from sb3_aarl.search.training.setup import make_env
 
 from sb3_aarl import AuxLoss, SACAux, catalog
 

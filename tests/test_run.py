@@ -14,21 +14,11 @@ from filelock import FileLock, Timeout
 from hypothesis import given
 from hypothesis import strategies as st
 from sb3_aarl.search.training import run as module
-from sb3_aarl.search.training.config import ConfigError
+from sb3_aarl.search.training.config import ConfigError, checkpoint_interval, spread_checkpoints
+from sb3_aarl.search.training.folder import Outcome, is_finished, read_outcome
 from sb3_aarl.search.training.provenance import read_about, write_about
-from sb3_aarl.search.training.run import (
-    Outcome,
-    Run,
-    Setup,
-    check_run,
-    checkpoint_interval,
-    is_finished,
-    make_env,
-    prepare_run,
-    read_outcome,
-    spread_checkpoints,
-    train,
-)
+from sb3_aarl.search.training.run import Run, check_run, prepare_run, train
+from sb3_aarl.search.training.setup import Setup, make_env
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import DENSE
@@ -299,7 +289,7 @@ def test_evaluations_are_normalized_like_training_without_changing_it(tmp_path: 
             super().__init__(*args, **kwargs)
             made.append(self)
 
-    monkeypatch.setattr(module, "VecNormalize", Watched)
+    monkeypatch.setattr("sb3_aarl.search.training.setup.VecNormalize", Watched)
     prepare_run(tmp_path, make_run(hyperparameters=DENSE | {"normalize": {"clip_obs": 5.0}, "gamma": 0.9}))
     train(tmp_path)
     training, evaluation = made
@@ -345,7 +335,7 @@ def test_learning_rates_that_fall(tmp_path: Path) -> None:
 
 def test_wrappers_are_in_training_and_evaluation(tmp_path: Path) -> None:
     wrappers = ["gymnasium.wrappers.ClipAction", {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 8}}]
-    setup = module.Setup(make_run(hyperparameters=DENSE | {"env_wrapper": wrappers}), "here")
+    setup = Setup(make_run(hyperparameters=DENSE | {"env_wrapper": wrappers}), "here")
     assert setup.episode_steps == 8
     for env in (setup.training_env(), setup.evaluation_env()):
         env.reset()

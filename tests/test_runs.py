@@ -7,7 +7,7 @@ from typing import Any
 import psutil
 import pytest
 from sb3_aarl.search.execution.runs import LocalExecutor, Submission, mean_curve
-from sb3_aarl.search.training.run import is_finished
+from sb3_aarl.search.training.folder import is_finished
 from tiny import tiny_run
 
 from sb3_aarl.callbacks import Evaluation

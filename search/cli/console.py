@@ -14,7 +14,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     import pandas as pd
-    from sb3_aarl.search.training.run import Run
+    from sb3_aarl.search.training.folder import Run
 
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)

@@ -13,7 +13,7 @@ from sb3_aarl.search.training.shipped import find_file
 if TYPE_CHECKING:
     import pandas as pd
     from sb3_aarl.search.execution.matrix import Matrix
-    from sb3_aarl.search.training.run import Run
+    from sb3_aarl.search.training.folder import Run
 
 
 app = typer.Typer()
@@ -35,7 +35,7 @@ def train_matrix(matrix: "Matrix", workers: int, retries: int = 3, config: Path 
 def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
     """The runs of a matrix that are not finished, by variant and environment."""
     from sb3_aarl.search.execution.matrix import cell_folder, task_name
-    from sb3_aarl.search.training.run import is_finished
+    from sb3_aarl.search.training.folder import is_finished
 
     kinds: dict[str, list[Run]] = {}
     for cell, run in matrix.runs.items():
@@ -63,7 +63,7 @@ def compare(
 def exit_if_failed(matrix: "Matrix") -> None:
     """Name the runs that failed, in one line each; exit code 1 if there are any."""
     from sb3_aarl.search.execution.matrix import cell_folder
-    from sb3_aarl.search.training.run import read_outcome
+    from sb3_aarl.search.training.folder import read_outcome
 
     outcomes = {cell: read_outcome(cell_folder(matrix.folder, cell)) for cell in matrix.runs}
     found = {cell: outcome.failure for cell, outcome in outcomes.items() if outcome and outcome.failure is not None}

@@ -61,7 +61,7 @@ def read_config(path: Path, **changes: Any) -> "SearchConfig":
     """The configuration of a search, with the values of options over those of its file; that its runs can start is checked."""
     from sb3_aarl.search.studies.config import load_config
     from sb3_aarl.search.studies.search import make_run
-    from sb3_aarl.search.training.run import check_run
+    from sb3_aarl.search.training.setup import check_run
 
     from sb3_aarl import catalog
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from optuna import Trial
     from sb3_aarl.search.execution.driver import SearchProgress
     from sb3_aarl.search.studies.config import SearchConfig
-    from sb3_aarl.search.training.run import Run
+    from sb3_aarl.search.training.folder import Run
 
 app = typer.Typer()
 # Seconds between two drawings of the evolution, which holds every candidate.

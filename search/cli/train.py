@@ -43,7 +43,7 @@ def train(
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.search.studies.single import prepare_one
-    from sb3_aarl.search.training.run import is_finished, read_run
+    from sb3_aarl.search.training.folder import is_finished, read_run
     from sb3_aarl.search.training.run import train as train_run
 
     from sb3_aarl.callbacks import aulc
@@ -175,7 +175,7 @@ def video(
 
 def play(model: Path, env: str | None, episodes: int, seed: int, imports: str, frames: list[Any] | None = None) -> list[float]:
     """The returns of a model's episodes, and, where wanted, their pictures."""
-    from sb3_aarl.search.studies.single import load_trained
+    from sb3_aarl.search.training.setup import load_trained
     from stable_baselines3.common.evaluation import evaluate_policy
 
     trained, environment = load_trained(model, env, frames is not None, modules(imports))

@@ -17,8 +17,8 @@ from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.evolution.space import loss_of, suggest_aux_loss
 from sb3_aarl.search.execution.runs import Executor, RunFailed, Submission, mean_curve
 from sb3_aarl.search.execution.storage import cause, driver_lock, is_temporary
+from sb3_aarl.search.training.folder import Run, partial_curve
 from sb3_aarl.search.training.provenance import commit, read_about, versions
-from sb3_aarl.search.training.run import Run, partial_curve
 from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
 from sb3_aarl.aux_loss import AuxLoss

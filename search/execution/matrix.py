@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 from sb3_aarl.search.execution.runs import Executor, Submission
+from sb3_aarl.search.training.folder import FAILED, Run, is_finished, partial_curve, prepare_run
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
-from sb3_aarl.search.training.run import FAILED, Run, check_run, is_finished, partial_curve, prepare_run
+from sb3_aarl.search.training.setup import check_run
 
 from sb3_aarl.callbacks import Evaluation, aulc
 from sb3_aarl.envs import PREFIX

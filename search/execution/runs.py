@@ -11,18 +11,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from sb3_aarl.search.training.folder import STOP, Outcome, Run, is_finished, partial_curve, prepare_run, read_outcome, read_run
 from sb3_aarl.search.training.provenance import provenance, read_about, write_about
-from sb3_aarl.search.training.run import (
-    LOCKED,
-    STOP,
-    Outcome,
-    Run,
-    is_finished,
-    partial_curve,
-    prepare_run,
-    read_outcome,
-    read_run,
-)
+from sb3_aarl.search.training.run import LOCKED
 
 from sb3_aarl.callbacks import Evaluation
 

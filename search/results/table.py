@@ -16,7 +16,7 @@ from sb3_aarl.search.execution.matrix import comparable, task_name
 from sb3_aarl.search.results.statistics import SUITE, improvements, interquartile_means
 from sb3_aarl.search.studies import operator_selection
 from sb3_aarl.search.studies.benchmark import read_abouts
-from sb3_aarl.search.training.run import FAILED, partial_curve
+from sb3_aarl.search.training.folder import FAILED, partial_curve
 
 from sb3_aarl.envs import PREFIX
 

@@ -13,13 +13,15 @@ from sb3_aarl.search.execution.matrix import Cell, Matrix, task_name
 from sb3_aarl.search.training.config import (
     ConfigError,
     action_repeat,
+    check_checkpoints,
     import_modules,
     load_hyperparameters,
     read_yaml,
     resolve_env_id,
 )
+from sb3_aarl.search.training.folder import FREE, Run, differences, partial_curve
 from sb3_aarl.search.training.provenance import ABOUT, read_about
-from sb3_aarl.search.training.run import FREE, Run, check_checkpoints, check_run, differences, partial_curve
+from sb3_aarl.search.training.setup import check_run
 
 from sb3_aarl import catalog
 from sb3_aarl.envs import PREFIX

@@ -18,8 +18,7 @@ from pydantic import (
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import MAX_HORIZON, loss_to_params
 from sb3_aarl.search.training import config as training
-from sb3_aarl.search.training.config import ConfigError
-from sb3_aarl.search.training.run import check_checkpoints
+from sb3_aarl.search.training.config import ConfigError, check_checkpoints
 from sb3_aarl.search.training.shipped import find_file
 
 from sb3_aarl import catalog

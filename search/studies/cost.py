@@ -6,7 +6,8 @@ from contextlib import closing
 
 import pandas as pd
 import torch as th
-from sb3_aarl.search.training.run import Run, Setup
+from sb3_aarl.search.training.folder import Run
+from sb3_aarl.search.training.setup import Setup
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_aarl.buffers import ARRAYS, WindowReplayBuffer

@@ -15,7 +15,7 @@ from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
 from sb3_aarl.search.studies.search import check_study, make_run
 from sb3_aarl.search.training.config import ConfigError
-from sb3_aarl.search.training.run import Run
+from sb3_aarl.search.training.folder import Run
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss

@@ -14,7 +14,7 @@ from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.execution.matrix import Cell, Matrix
 from sb3_aarl.search.studies.config import Baseline, SearchConfig
-from sb3_aarl.search.training.run import FREE, Run, differences
+from sb3_aarl.search.training.folder import FREE, Run, differences
 
 from sb3_aarl.aux_loss import AuxLoss
 

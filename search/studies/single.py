@@ -1,31 +1,25 @@
-"""One training run by hand, behind ``aarl train``: it keeps the model; and what is done with such a model."""
+"""One training run by hand, behind ``aarl train``."""
 
 import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_aarl.search.training.config import ConfigError, action_repeat, import_modules, load_hyperparameters, resolve_env_id
-from sb3_aarl.search.training.run import (
-    MODEL,
-    NORMALIZE,
-    RUN,
-    Run,
-    check_run,
+from sb3_aarl.search.training.config import (
+    ConfigError,
+    action_repeat,
     checkpoint_interval,
-    make_env,
-    prepare_run,
-    read_run,
+    import_modules,
+    load_hyperparameters,
+    resolve_env_id,
     spread_checkpoints,
 )
+from sb3_aarl.search.training.folder import Run, prepare_run
+from sb3_aarl.search.training.setup import check_run
 from sb3_aarl.search.training.shipped import find_file
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_aarl import SACAux, catalog
+from sb3_aarl import catalog
 from sb3_aarl.envs import PREFIX
-
-VIDEO_SIZE = 320  # pixels, height and width
 
 
 def prepare_one(
@@ -81,32 +75,3 @@ def prepare_one(
     check_run(run, str(file))
     prepare_run(folder, run)
     return folder
-
-
-def load_trained(
-    path: Path, environment: str | None = None, renders: bool = False, imports: Sequence[str] = ()
-) -> tuple[SACAux, VecEnv]:
-    """A trained model, and an environment for it: that of the run that it is from, or another one."""
-    folder = path if path.is_dir() else path.parent
-    model = folder / MODEL if path.is_dir() else path
-    if not model.is_file():
-        raise ValueError(f"{model} does not exist: name a model, or the folder of a run that has one, such as of aarl train")
-    run = read_run(folder) if (folder / RUN).exists() else None
-    import_modules([*(run.imports if run else ()), *imports])
-    if environment is None and run is None:
-        raise ValueError(f"which environment? No {RUN} is beside {model}: name it as a second argument")
-    env_id = resolve_env_id(environment) if environment is not None else run.environment  # type: ignore[union-attr]
-    settings = run.hyperparameters if run else {}
-    env_kwargs = settings.get("env_kwargs") or {}
-    if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
-        env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}
-    try:
-        env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
-    except TypeError as error:  # Gymnasium's, for an environment that takes no render_mode
-        raise ValueError(f"{env_id} cannot be made: {error}") from error
-    if renders and "rgb_array" not in env.get_attr("metadata")[0].get("render_modes", ()):
-        raise ValueError(f"{env_id} has no pictures: its metadata's render_modes are without rgb_array")
-    if (folder / NORMALIZE).exists():
-        env = VecNormalize.load(str(folder / NORMALIZE), env)
-        env.training = env.norm_reward = False
-    return SACAux.load(model, env), env

@@ -14,8 +14,8 @@ from sb3_aarl.search.execution import driver
 from sb3_aarl.search.execution.matrix import share_left
 from sb3_aarl.search.execution.storage import has_driver, is_locked
 from sb3_aarl.search.studies.search import stored_settings
+from sb3_aarl.search.training.folder import LOCK, RUN, partial_curve, read_outcome, read_run
 from sb3_aarl.search.training.provenance import read_about
-from sb3_aarl.search.training.run import LOCK, RUN, partial_curve, read_outcome, read_run
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import aulc

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import json
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -89,6 +89,31 @@ def env_wrappers(value: Any) -> list[tuple[type[gym.Wrapper], dict[str, Any]]]:
 def action_repeat(hyperparameters: Mapping[str, Any]) -> int:
     """Environment steps of one agent step."""
     return (hyperparameters.get("env_kwargs") or {}).get("action_repeat", 1)
+
+
+def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
+    """Environment steps of one rollout with these hyper-parameters: every checkpoint is a multiple of them."""
+    train_freq = hyperparameters.get("train_freq", 1)
+    rollout = train_freq if isinstance(train_freq, int) else 1 if train_freq[1] == "episode" else train_freq[0]
+    return max(1, rollout) * hyperparameters.get("n_envs", 1) * action_repeat(hyperparameters)
+
+
+def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, Any], source: str) -> None:
+    """Every checkpoint has to be the end of a rollout."""
+    interval = checkpoint_interval(hyperparameters)
+    if between := [steps for steps in sorted(checkpoints) if steps % interval]:
+        of_what = f"{interval} (train_freq x n_envs x action repeat)"
+        raise ConfigError(f"{source}: checkpoints must be multiples of {of_what}, {between} are not")
+
+
+def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int = 1) -> tuple[int, ...]:
+    """Equally spaced checkpoints, multiples of an interval; the last is a little early where they do not divide the run."""
+    if n_evaluations < 1 or environment_steps < n_evaluations * interval:
+        raise ValueError(
+            f"{environment_steps} environment steps, {interval} at a time, are too few for {n_evaluations} evaluations"
+        )
+    every = environment_steps // n_evaluations // interval * interval
+    return tuple(every * (i + 1) for i in range(n_evaluations))
 
 
 def resolve_env_id(name: str) -> str:

@@ -1,0 +1,218 @@
+"""What a run is trained with: environments, a model, and whether they can be made at all."""
+
+import functools
+import inspect
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+from sb3_aarl.search.training.checkpoint import TruncateAt
+from sb3_aarl.search.training.config import (
+    VEC_ENVS,
+    ConfigError,
+    action_repeat,
+    check_checkpoints,
+    check_hyperparameters,
+    env_wrappers,
+    import_modules,
+    resolve_env_id,
+)
+from sb3_aarl.search.training.folder import MODEL, NORMALIZE, RUN, Run, one_line, read_run
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+from sb3_aarl import AuxLoss, SACAux
+from sb3_aarl.callbacks import SingleEpisodes
+from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
+
+logger = logging.getLogger(__name__)
+
+# Evaluations are normalized with the statistics of training, and have the task's own rewards.
+FIXED = {"training": False, "norm_reward": False}
+# Agent steps of the shortest run that is compiled: it takes two minutes, and saves at most 15 ms of a gradient step, from
+# pixels (benchmarks/README.md).
+COMPILED_STEPS = 8_000
+VIDEO_SIZE = 320  # pixels of a film, height and width
+# Agent steps of a run that is tried out: so that there are windows.
+TRIED_STEPS = 20
+
+
+def make_env(env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any = None, renders: bool = False) -> gym.Env:
+    """The environment of a configuration. ``renders`` has it render if it observes no pixels, too."""
+    if env_id.startswith(PREFIX):
+        env = make_dmc_env(env_id, **env_kwargs)
+    else:
+        arguments: dict[str, Any] = {"render_mode": "rgb_array"} if renders or env_kwargs.get("pixels") else {}
+        env = wrap_env(gym.make(env_id, **arguments), **env_kwargs)
+    for wrapper, wrapper_arguments in env_wrappers(env_wrapper):
+        env = wrapper(env, **wrapper_arguments)
+    return env
+
+
+def _make_in_process(
+    imports: Sequence[str], env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any, steps: Sequence[int]
+) -> gym.Env:
+    import_modules(imports)  # the process may be one of the environment alone
+    return TruncateAt(make_env(env_id, env_kwargs, env_wrapper), steps)
+
+
+class Setup:
+    """What a run is trained with; its settings are from ``source``, in messages."""
+
+    def __init__(self, run: Run, source: str):
+        self.run = run
+        import_modules(run.imports)
+        settings = check_hyperparameters(run.hyperparameters, run.environment, source)
+        self.action_repeat = action_repeat(settings)
+        check_checkpoints(run.checkpoints, settings, source)
+        train_freq = settings.get("train_freq")
+        if isinstance(train_freq, tuple) and train_freq[1] == "episode" and train_freq[0] > 1:
+            raise ConfigError(f"{source}: train_freq must be 1 episode at most: a rollout has to end at each checkpoint")
+        settings.pop("n_timesteps", None)
+        self.env_kwargs: dict[str, Any] = settings.pop("env_kwargs", None) or {}
+        self.env_wrapper = settings.pop("env_wrapper", None)
+        self.pixels = self.env_kwargs.get("pixels", False)
+        self.policy = settings.pop("policy", None)
+        self.n_envs, self.vec_env = settings.pop("n_envs", 1), VEC_ENVS[settings.pop("vec_env", "dummy")]
+        normalize = settings.pop("normalize", False)
+        self.normalize: dict[str, Any] | None = {} if normalize is True else normalize if normalize is not False else None
+        if self.normalize is not None and "gamma" in settings:  # as in RL-Zoo
+            self.normalize = {"gamma": settings["gamma"], **self.normalize}
+        self.agent_steps = run.checkpoints[-1] // self.action_repeat
+        # The same run with less memory and a smaller checkpoint; each environment has an equal share of the buffer.
+        default = inspect.signature(SACAux).parameters["buffer_size"].default
+        needed = math.ceil(self.agent_steps / self.n_envs) * self.n_envs
+        settings["buffer_size"] = min(settings.get("buffer_size", default), needed)
+        if settings.get("compile") and self.agent_steps < COMPILED_STEPS:
+            settings["compile"] = False
+        self.settings = _with_schedules(settings) | {"aux_loss": run.aux_loss, "seed": run.seed}
+
+        of_dmc = run.environment.startswith(PREFIX)
+        limits = [EPISODE_LENGTH if of_dmc else gym.spec(run.environment).max_episode_steps]
+        for wrapper, arguments in env_wrappers(self.env_wrapper):
+            limits += [arguments["max_episode_steps"] * self.action_repeat] if wrapper is gym.wrappers.TimeLimit else []
+        self.episode_steps = min((limit for limit in limits if limit is not None), default=None)
+
+    def _make(self, steps: Sequence[int] = ()) -> Callable[[], gym.Env]:
+        run = self.run
+        return functools.partial(_make_in_process, run.imports, run.environment, self.env_kwargs, self.env_wrapper, steps)
+
+    def training_env(self, trained: int = 0) -> VecEnv:
+        """Environments that are truncated at the checkpoints after so many environment steps of training."""
+        steps = [(steps - trained) // self.action_repeat // self.n_envs for steps in self.run.checkpoints]
+        env = make_vec_env(self._make(steps), self.n_envs, seed=self.run.seed, vec_env_cls=self.vec_env)
+        return env if self.normalize is None else VecNormalize(env, **self.normalize)
+
+    def evaluation_env(self) -> VecEnv:
+        # From states a prediction takes as long as a step of an environment: one for all episodes. A picture takes much
+        # longer than the prediction from it, and each environment that renders has tens of megabytes for it.
+        episodes = self.run.evaluation_episodes
+        n_envs, vec_env = (min(self.n_envs, episodes), self.vec_env) if self.pixels else (episodes, DummyVecEnv)
+        env = make_vec_env(self._make(), n_envs, seed=0, vec_env_cls=vec_env, wrapper_class=SingleEpisodes)
+        return env if self.normalize is None else VecNormalize(env, **{**self.normalize, **FIXED})
+
+    def model(self, env: VecEnv) -> SACAux:
+        fitting = "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
+        if isinstance(env.observation_space, spaces.Dict):
+            fitting = "MultiInputPolicy"
+        return SACAux(self.policy or fitting, env, **self.settings)
+
+
+def _with_schedules(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings, and those in their mappings, with functions for learning rates such as ``lin_3e-4``."""
+    read: dict[str, Any] = {}
+    for key, value in settings.items():
+        is_schedule = isinstance(value, str) and value.startswith("lin_")
+        read[key] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0) if is_schedule else value
+        if isinstance(value, Mapping):
+            read[key] = _with_schedules(value)
+    return read
+
+
+def check_run(run: Run, source: str | None = None) -> Setup:
+    """
+    Try a run out, before it is submitted: make its environment and model, train for some steps. Warn of what a user may not
+    have meant.
+
+    :param run: The run
+    :param source: The file with its settings, for messages; None for the environment alone
+    :return: What it is trained with
+    :raises ConfigError: with the reason in one line, when it cannot be trained
+    """
+    what = f"{source or ''}: {run.environment} cannot be trained with these settings".removeprefix(": ")
+    try:
+        setup = Setup(run, source or run.environment)
+        setup.settings.pop("compile", None)  # it takes minutes
+        with closing(setup.training_env()) as env, TemporaryDirectory() as folder:
+            model = setup.model(env)
+            learning_starts = model.learning_starts
+            model.tensorboard_log = None if model.tensorboard_log is None else folder
+            try_out(model)
+    except ConfigError:
+        raise
+    except Exception as error:  # Gymnasium, SB3 and PyTorch have errors of all kinds
+        raise ConfigError(f"{what}: {one_line(error)}") from error
+    horizon = model.aux_loss.horizon * setup.action_repeat if isinstance(model.aux_loss, AuxLoss) else 0
+    if setup.episode_steps is not None and setup.episode_steps < horizon:
+        problem = f"have {setup.episode_steps} environment steps, the horizon of {model.aux_loss} {horizon}"
+        raise ConfigError(f"{what}: episodes {problem}")
+    if setup.agent_steps <= learning_starts:
+        message = "%d agent steps are all random actions, nothing is learnt: learning_starts is %d"
+        logger.warning(message, setup.agent_steps, learning_starts)
+    apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
+    if setup.episode_steps is None:
+        logger.warning("%s has no time limit: an evaluation waits until its episodes end", run.environment)
+    elif apart < setup.episode_steps * setup.n_envs:
+        message = "evaluating every %d environment steps truncates episodes, which may have %d"
+        logger.warning(message, apart // setup.n_envs, setup.episode_steps)
+    return setup
+
+
+def try_out(model: SACAux) -> None:
+    """Make some steps with a model, with its own actions, and gradient steps of all its parts."""
+
+    def step(*_: Any) -> bool:
+        if model.num_timesteps < TRIED_STEPS * model.n_envs:
+            return True
+        model.train(2, model.batch_size)  # the actor is not trained at each
+        return False  # whatever the length of a rollout is
+
+    model.verbose = model.learning_starts = 0
+    model.learn(TRIED_STEPS * model.n_envs, step)
+
+
+def load_trained(
+    path: Path, environment: str | None = None, renders: bool = False, imports: Sequence[str] = ()
+) -> tuple[SACAux, VecEnv]:
+    """A trained model, and an environment for it: that of the run that it is from, or another one."""
+    folder = path if path.is_dir() else path.parent
+    model = folder / MODEL if path.is_dir() else path
+    if not model.is_file():
+        raise ValueError(f"{model} does not exist: name a model, or the folder of a run that has one, such as of aarl train")
+    run = read_run(folder) if (folder / RUN).exists() else None
+    import_modules([*(run.imports if run else ()), *imports])
+    if environment is None and run is None:
+        raise ValueError(f"which environment? No {RUN} is beside {model}: name it as a second argument")
+    env_id = resolve_env_id(environment) if environment is not None else run.environment  # type: ignore[union-attr]
+    settings = run.hyperparameters if run else {}
+    env_kwargs = settings.get("env_kwargs") or {}
+    if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
+        env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}
+    try:
+        env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
+    except TypeError as error:  # Gymnasium's, for an environment that takes no render_mode
+        raise ValueError(f"{env_id} cannot be made: {error}") from error
+    if renders and "rgb_array" not in env.get_attr("metadata")[0].get("render_modes", ()):
+        raise ValueError(f"{env_id} has no pictures: its metadata's render_modes are without rgb_array")
+    if (folder / NORMALIZE).exists():
+        env = VecNormalize.load(str(folder / NORMALIZE), env)
+        env.training = env.norm_reward = False
+    return SACAux.load(model, env), env
