@@ -15,7 +15,7 @@ import gymnasium as gym
 import optuna
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.execution.driver import Driver
-from sb3_aarl.search.execution.runs import LocalExecutor
+from sb3_aarl.search.execution.executors import LocalExecutor
 from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.training.run import Run
 

@@ -43,7 +43,7 @@ def postgres() -> Iterator[Postgres]:
 def executor(monkeypatch: pytest.MonkeyPatch) -> Planted:
     """In the place of this machine's processes."""
     executor = Planted()
-    monkeypatch.setattr("sb3_aarl.search.execution.runs.LocalExecutor", executor)
+    monkeypatch.setattr("sb3_aarl.search.execution.executors.LocalExecutor", executor)
     monkeypatch.setattr("sb3_aarl.search.execution.matrix.POLL_SECONDS", 0)
     monkeypatch.setattr("sb3_aarl.search.execution.driver.POLL_SECONDS", 0)
     return executor

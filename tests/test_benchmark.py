@@ -10,8 +10,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from sb3_aarl.search.execution.executors import LocalExecutor
 from sb3_aarl.search.execution.matrix import Cell, cell_folder, comparable, run_matrix, scores
-from sb3_aarl.search.execution.runs import LocalExecutor
 from sb3_aarl.search.results import table
 from sb3_aarl.search.studies import benchmark
 from sb3_aarl.search.studies.benchmark import load_benchmark, parse_seeds, parse_steps, read_abouts, read_curves
@@ -177,28 +177,24 @@ def test_runs_that_were_copied_together_are_compared_only_if_trained_alike(folde
 
 
 def test_the_time_to_go_is_that_of_the_steps_that_are_left(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seconds = iter([0.0, 10.0, 20.0])
-    monkeypatch.setattr(
-        "sb3_aarl.search.execution.matrix.time", SimpleNamespace(monotonic=lambda: next(seconds), sleep=lambda _: None)
-    )
+    monkeypatch.setattr("sb3_aarl.search.execution.matrix.POLL_SECONDS", 0)
     matrix = load("mine.yml", seeds=[0, 1], checkpoints=[80], every=20)
     paths = [cell_folder(Path("out"), cell) for cell in matrix.runs]
     future: Future[Any] = Future()
 
     def evaluate(path: Path, *steps: int) -> list[Evaluation]:
-        write_curve(path / "curve.csv", curve := [Evaluation(step, 0.0, 0.0, 1, 1.0) for step in steps])
+        write_curve(path / "curve.csv", curve := [Evaluation(step, 0.0, 0.0, 1, step / 2) for step in steps])
         return curve
 
     paths[0].mkdir(parents=True)
     evaluate(paths[0], 20)  # of an earlier session
     progress = run_matrix(matrix, SimpleNamespace(submit=lambda *_: future), workers=1)
-    assert next(progress).seconds_to_go is None
+    assert next(progress).seconds_to_go == pytest.approx(40 * 1.75)
     evaluate(paths[0], 20, 40)
-    assert next(progress).seconds_to_go == pytest.approx(10 * 1.5 / 0.25)
-    assert matrix_status(Path("out"))[1] == pytest.approx(1 / 0.5 * 1.5)
+    assert next(progress).seconds_to_go == matrix_status(Path("out"))[1] == pytest.approx(40 * 1.5)
     curve = evaluate(paths[0], 20, 40, 60, 80)
     future.set_result({"curve": [list(point) for point in curve], "failure": None, "retry": False})
-    assert next(progress)[1:] == (1, 0, pytest.approx(20 / 0.75))
+    assert next(progress)[1:] == (1, 0, pytest.approx(40))
 
 
 @pytest.mark.slow

@@ -18,8 +18,8 @@ from sb3_aarl.search.cli.main import explain
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import loss_of, loss_to_params, suggest_aux_loss
 from sb3_aarl.search.execution import driver
-from sb3_aarl.search.execution.driver import Driver
-from sb3_aarl.search.execution.runs import RunFailed
+from sb3_aarl.search.execution.driver import Driver, RunFailed
+from sb3_aarl.search.execution.queue import Queue
 from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.training.run import Run
 
@@ -121,6 +121,7 @@ def test_losses_and_scores_depend_on_nothing_but_the_seed(workers: int, tmp_path
         executor = Executor()  # processes end with their driver
         search = start(tmp_path, executor, workers, retries=100)
         for progress in search:  # noqa: B007
+            assert len(executor.pending) <= workers
             if rng.random() < 0.05:
                 break
             if executor.pending and rng.random() < 0.7:
@@ -262,6 +263,19 @@ def test_reports_the_mean_over_the_seeds_and_prunes(tmp_path: Path) -> None:
             assert trial.value == pytest.approx(sum(means) / 3)
             assert [point[1] for point in trial.user_attrs["curve"]] == pytest.approx(means)
     assert pruned and complete
+
+
+def test_a_run_that_is_told_to_stop_is_not_submitted_again(tmp_path: Path) -> None:
+    executor, rng = Executor(), random.Random(0)
+    queue = Queue(executor, workers=1)
+    running, waiting = (queue.add(tmp_path / str(run.seed), run) for run in make_runs(AuxLoss.parse("{s_t} -> {r_t}")))
+    queue.update()
+    for job in (running, waiting):
+        job.stop()
+    executor.end(rng, "it was killed", retry=True)
+    queue.update()
+    assert running.failure is None and running.is_over and waiting.is_over and waiting.curve == []
+    assert not queue.jobs and not executor.pending and not (tmp_path / "1").exists()
 
 
 def test_enqueued_losses_are_trained_and_invalid_ones_cost_nothing(tmp_path: Path) -> None:

@@ -6,7 +6,9 @@ from typing import Any
 
 import psutil
 import pytest
-from sb3_aarl.search.execution.runs import LocalExecutor, Submission, mean_curve
+from sb3_aarl.search.execution.driver import mean_curve
+from sb3_aarl.search.execution.executors import LocalExecutor
+from sb3_aarl.search.execution.queue import Queue
 from sb3_aarl.search.training.folder import is_finished
 from tiny import tiny_run
 
@@ -20,14 +22,17 @@ def children() -> list[int]:
     return [process.pid for process in psutil.Process().children() if "sb3_aarl.search.training.run" in process.cmdline()]
 
 
-def wait_done(submission: Submission) -> None:
-    while not submission.done():
+def wait(queue: Queue) -> None:
+    while queue.jobs:
+        queue.update()
         time.sleep(0.05)
 
 
 def test_leaving_the_executor_ends_its_processes(tmp_path: Path) -> None:
     with LocalExecutor(1) as executor:
-        Submission(executor, tmp_path, tiny_run(checkpoints=(50_000, 100_000)), retries=0)
+        queue = Queue(executor)
+        queue.add(tmp_path, tiny_run(checkpoints=(50_000, 100_000)))
+        queue.update()
         while not children():
             time.sleep(0.05)
     assert not children()
@@ -50,9 +55,10 @@ def test_executors_that_fail_are_retried(tmp_path: Path) -> None:
             return Lost()
 
     executor = Executor()
-    submission = Submission(executor, tmp_path, tiny_run(), retries=2)
-    wait_done(submission)
-    assert executor.calls == 3 and submission.failure == "ConnectionError: the node is gone"
+    queue = Queue(executor, retries=2)
+    job = queue.add(tmp_path, tiny_run())
+    wait(queue)
+    assert executor.calls == 3 and job.failure == "ConnectionError: the node is gone"
 
 
 def test_mean_curve_is_over_all_seeds() -> None:

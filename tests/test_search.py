@@ -128,7 +128,7 @@ def test_postgresql_restarts_in_the_middle(
             return super().submit(fn, path)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sb3_aarl.search.execution.runs.LocalExecutor", lambda workers: Restarting())
+    monkeypatch.setattr("sb3_aarl.search.execution.executors.LocalExecutor", lambda workers: Restarting())
     url = postgres.create("restarted")
     result = CliRunner().invoke(app, ["search", str(write_search(tmp_path, SHORT)), "--storage", url])
     assert result.exit_code == 0, result.output

@@ -50,7 +50,7 @@ def explain(error: Exception) -> str | None:
         kinds.append(Error)  # such as one about a library that renders
     if "sb3_aarl.search.execution.storage" in sys.modules:
         from optuna.exceptions import StorageInternalError
-        from sb3_aarl.search.execution.runs import RunFailed
+        from sb3_aarl.search.execution.driver import RunFailed
         from sb3_aarl.search.execution.storage import cause
         from sb3_aarl.search.training.provenance import hide_password
         from sqlalchemy.exc import SQLAlchemyError

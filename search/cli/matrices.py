@@ -21,8 +21,8 @@ app = typer.Typer()
 
 def train_matrix(matrix: "Matrix", workers: int, retries: int = 3, config: Path | None = None) -> None:
     """Train the runs of a matrix that are not finished, which are tried out if they are of a search, and show the progress."""
+    from sb3_aarl.search.execution.executors import LocalExecutor
     from sb3_aarl.search.execution.matrix import check_matrix, run_matrix
-    from sb3_aarl.search.execution.runs import LocalExecutor
 
     if config is not None:
         check_matrix(matrix, str(config))

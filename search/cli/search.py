@@ -54,7 +54,7 @@ def search(
     from optuna import get_all_study_names, logging
     from optuna_dashboard import save_note
     from sb3_aarl.search.execution.driver import Driver
-    from sb3_aarl.search.execution.runs import LocalExecutor
+    from sb3_aarl.search.execution.executors import LocalExecutor
     from sb3_aarl.search.execution.storage import STUDY_FILE, open_storage
     from sb3_aarl.search.results.dashboard import HOW_TO_READ, annotate_trial, update_plots
     from sb3_aarl.search.results.report import stored_baselines

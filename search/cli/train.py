@@ -42,6 +42,7 @@ def train(
     json: Json = False,
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
+    from sb3_aarl.search.execution.queue import seconds_to_go
     from sb3_aarl.search.studies.single import prepare_one
     from sb3_aarl.search.training.folder import is_finished, read_run
     from sb3_aarl.search.training.run import train as train_run
@@ -50,8 +51,8 @@ def train(
 
     def show(curve: "list[Evaluation]") -> None:
         point = curve[-1]
-        left = (evaluations - len(curve)) * point.seconds / len(curve)
-        errors.print(f"{point.environment_steps:,} environment steps: {point.mean:.1f} ± {point.std:.1f}, {time_to_go(left)}")
+        to_go = seconds_to_go([point.seconds / len(curve)], evaluations - len(curve), 1)
+        errors.print(f"{point.environment_steps:,} environment steps: {point.mean:.1f} ± {point.std:.1f}, {time_to_go(to_go)}")
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)

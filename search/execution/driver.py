@@ -15,14 +15,15 @@ from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.evolution.space import loss_of, suggest_aux_loss
-from sb3_aarl.search.execution.runs import Executor, RunFailed, Submission, mean_curve
+from sb3_aarl.search.execution.executors import Executor
+from sb3_aarl.search.execution.queue import Job, Queue, seconds_to_go
 from sb3_aarl.search.execution.storage import cause, driver_lock, is_temporary
 from sb3_aarl.search.training.folder import Run, partial_curve
 from sb3_aarl.search.training.provenance import commit, read_about, versions
 from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
 from sb3_aarl.aux_loss import AuxLoss
-from sb3_aarl.callbacks import aulc
+from sb3_aarl.callbacks import Evaluation, aulc
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +32,10 @@ POLL_SECONDS = 0.5
 MAX_FAILURES = 10
 # How long a database that is away is waited for.
 PATIENCE_SECONDS = 600
+
+
+class RunFailed(RuntimeError):
+    """Candidate after candidate failed; the message has the last reason."""
 
 
 class SearchProgress(NamedTuple):
@@ -49,20 +54,16 @@ class SearchProgress(NamedTuple):
 
 @dataclass
 class RunningTrial:
-    """A trial whose runs, one for each seed, are at the executor, and how many evaluations were reported to Optuna."""
+    """A trial whose runs, one for each seed, are in the queue, and how many evaluations were reported to Optuna."""
 
     trial: optuna.Trial
-    submissions: list[Submission]
+    jobs: list[Job]
     n_reported: int = 0
-
-    def n_in_flight(self) -> int:
-        """How many of its runs are not over."""
-        return sum(not submission.done() for submission in self.submissions)
 
     def stop(self) -> None:
         """End its runs at their next evaluations."""
-        for submission in self.submissions:
-            submission.stop()
+        for job in self.jobs:
+            job.stop()
 
 
 @dataclass(eq=False)
@@ -75,7 +76,7 @@ class Driver:
     :param make_runs: The runs of a candidate, one for each seed
     :param executor: Where runs are executed
     :param folder: Folder of the search
-    :param workers: Runs that are in flight at the same time
+    :param workers: Runs that are at the executor at the same time
     :param retries: How often a run is resubmitted
     :param on_change: Called with a trial when it starts, when it is reported, and before it is told
     """
@@ -93,6 +94,7 @@ class Driver:
         if not isinstance(self.study.sampler, AuxLossSampler):
             raise TypeError(f"a search needs an AuxLossSampler, not {type(self.study.sampler).__name__}")
         self.sampler = self.study.sampler
+        self.queue = Queue(self.executor, self.workers, self.retries)
         self.running: dict[int, RunningTrial] = {}
         self.n_failures = 0
         # A database that is away for a while fails any of the calls; all may be repeated.
@@ -113,9 +115,10 @@ class Driver:
         try:
             self._patiently(self._interrupt_unknown)
             while True:
+                self.queue.update()
                 for running in list(self.running.values()):
                     self._check(running)
-                while self._has_room() and self._patiently(self.sampler.free_slots, self.study) > 0:
+                while self.queue.has_room and self._patiently(self.sampler.free_slots, self.study) > 0:
                     self._start(self._patiently(self._ask))
                 yield self._patiently(lambda: search_progress(self.study, self.sampler.progress(self.study)))
                 if not self.running and self._patiently(self.sampler.is_complete, self.study):
@@ -127,9 +130,6 @@ class Driver:
         finally:
             self.running.clear()
             self._interrupt_unknown()  # those that ran, and the one of an ask that was interrupted
-
-    def _has_room(self) -> bool:
-        return sum(running.n_in_flight() for running in self.running.values()) < self.workers
 
     def _ask(self) -> optuna.Trial:
         self._interrupt_unknown()  # of an ask that failed half way
@@ -161,26 +161,27 @@ class Driver:
         }
         self._note(trial, attributes)
         folder = candidate_folder(self.folder, trial)
-        submissions = [Submission(self.executor, folder / f"seed-{run.seed}", run, self.retries) for run in runs]
-        self.running[trial.number] = RunningTrial(trial, submissions)
+        jobs = [self.queue.add(folder / f"seed-{run.seed}", run) for run in runs]
+        self.running[trial.number] = RunningTrial(trial, jobs)
+        self.queue.update()
         self._patiently(self.on_change, trial)
 
     def _check(self, running: RunningTrial) -> None:
         """Report what a candidate's runs have evaluated, and tell when all of them are over."""
-        trial, submissions = running.trial, running.submissions
-        over = running.n_in_flight() == 0
-        curves = [submission.curve if over else partial_curve(submission.folder) for submission in submissions]
+        trial, jobs = running.trial, running.jobs
+        is_over = all(job.is_over for job in jobs)
+        curves = [job.curve if is_over else partial_curve(job.folder) for job in jobs]
         self._report(running, mean_curve(curves))
-        failure = next((submission.failure for submission in submissions if submission.failure is not None), None)
-        if failure is not None and not over:
+        failure = next((job.failure for job in jobs if job.failure is not None), None)
+        if failure is not None and not is_over:
             running.stop()
-        if not over:
+        if not is_over:
             return
-        session = read_about(submissions[0].folder).get("sessions", [{}])[-1]
+        session = read_about(jobs[0].folder).get("sessions", [{}])[-1]
         device = f"GPU: {session['gpu']}" if "cuda" in session.get("device", "") else f"CPU: {session.get('cpu')}"
         seconds = round(sum(curve[-1].seconds for curve in curves if curve), 1)
         self._note(trial, {"curve": mean_curve(curves), "seconds": seconds, "device": device})
-        checkpoints = submissions[0].run.checkpoints
+        checkpoints = jobs[0].run.checkpoints
         if failure is None:
             failure = next((f"its mean return is {mean}" for _, mean in mean_curve(curves) if not math.isfinite(mean)), None)
         if failure is not None:
@@ -197,7 +198,7 @@ class Driver:
         for steps, mean in news:
             self._patiently(trial.report, mean, int(steps))
             running.n_reported += 1
-            if steps != running.submissions[0].run.checkpoints[-1] and self._patiently(trial.should_prune):
+            if steps != running.jobs[0].run.checkpoints[-1] and self._patiently(trial.should_prune):
                 running.stop()
         if news:
             self._patiently(self.on_change, trial)
@@ -232,13 +233,18 @@ def search_progress(study: optuna.Study, generations: list[GenerationProgress]) 
     best = study.best_trial if complete else None
     seconds = [trial.duration.total_seconds() for trial in complete if trial.duration is not None]
     left = sum(generation.slots - generation.filled for generation in generations)
-    at_once = max(1, sum(generation.running for generation in generations))
     return SearchProgress(
         generations,
         None if best is None else best.value,
         None if best is None else str(loss_of(best)),
-        float(np.mean(seconds)) * left / at_once if seconds else None,
+        seconds_to_go(seconds, left, sum(generation.running for generation in generations)),
     )
+
+
+def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
+    """The learning curve over several seeds, as long as the shortest: environment steps and mean return of each evaluation."""
+    evaluations = zip(*curves, strict=False)
+    return [[points[0].environment_steps, float(np.mean([point.mean for point in points]))] for points in evaluations]
 
 
 def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:

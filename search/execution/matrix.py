@@ -4,18 +4,19 @@ import hashlib
 import json
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-from sb3_aarl.search.execution.runs import Executor, Submission
+from sb3_aarl.search.execution.executors import Executor
+from sb3_aarl.search.execution.queue import Queue, pace, seconds_to_go
 from sb3_aarl.search.training.folder import FAILED, Run, is_finished, partial_curve, prepare_run
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
 from sb3_aarl.search.training.setup import check_run
 
-from sb3_aarl.callbacks import Evaluation, aulc
+from sb3_aarl.callbacks import aulc
 from sb3_aarl.envs import PREFIX
 from sb3_aarl.files import replace_text
 
@@ -87,46 +88,38 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
 
     :param matrix: The runs
     :param executor: Where they are executed
-    :param workers: Runs that are in flight at the same time
+    :param workers: Runs that are at the executor at the same time
     :param retries: How often a run is resubmitted
     :raises ValueError: before anything is trained, when a folder has a run with other settings
     """
-    for cell, run in matrix.runs.items():
-        path = cell_folder(matrix.folder, cell)
-        prepare_run(path, run)
+    folders = {cell: cell_folder(matrix.folder, cell) for cell in matrix.runs}
+    for cell, path in folders.items():
+        prepare_run(path, matrix.runs[cell])
         about = {**cell._asdict(), **matrix.abouts.get(cell, {})}
         if (before := read_about(path)) != before | about:
             write_about(path, before | about)
-    waiting = [cell for cell in matrix.runs if not is_finished(cell_folder(matrix.folder, cell))]
-    shares = {cell: share_left(partial_curve(cell_folder(matrix.folder, cell)), matrix.runs[cell]) for cell in waiting}
-    planned, started = sum(shares.values()), time.monotonic()
-    in_flight: dict[Cell, Submission] = {}
+    queue = Queue(executor, workers, retries)
+    jobs = {cell: queue.add(path, matrix.runs[cell]) for cell, path in folders.items() if not is_finished(path)}
+    paces = {cell: pace(run, partial_curve(folders[cell])) for cell, run in matrix.runs.items()}
     failed: set[Cell] = set()
-    while waiting or in_flight:
-        while waiting and len(in_flight) < workers:
-            cell = waiting.pop(0)
-            in_flight[cell] = Submission(executor, cell_folder(matrix.folder, cell), matrix.runs[cell], retries)
-        for cell in [cell for cell, submission in in_flight.items() if submission.done()]:
-            submission = in_flight.pop(cell)
-            del shares[cell]
-            if submission.failure is not None and not is_finished(submission.folder):
+    while True:
+        running = [cell for cell, job in jobs.items() if job.future is not None]
+        queue.update()
+        for cell in running:
+            job = jobs[cell]
+            paces[cell] = pace(job.run, partial_curve(job.folder))
+            if job.failure is not None and not is_finished(job.folder):
                 failed.add(cell)
-                if not (submission.folder / FAILED).exists():  # its process could not write it
-                    note = {"reason": submission.failure, "retry": True}
-                    replace_text(submission.folder / FAILED, json.dumps(note) + "\n")
-        shares |= {cell: share_left(partial_curve(running.folder), running.run) for cell, running in in_flight.items()}
-        left = sum(shares.values())
-        to_go = (time.monotonic() - started) / (planned - left) * left if left < planned else None
-        yield MatrixProgress(len(matrix.runs), len(matrix.runs) - len(shares) - len(failed), len(failed), to_go)
-        if shares:
-            time.sleep(POLL_SECONDS)
-    if not planned:
-        yield MatrixProgress(len(matrix.runs), len(matrix.runs), 0, 0.0)
-
-
-def share_left(curve: Sequence[Evaluation], run: Run) -> float:
-    """The share of a run's environment steps that are after its last evaluation."""
-    return 1 - curve[-1].environment_steps / run.checkpoints[-1] if curve else 1.0
+                if not (job.folder / FAILED).exists():  # its process could not write it
+                    replace_text(job.folder / FAILED, json.dumps({"reason": job.failure, "retry": True}) + "\n")
+        seconds = [seconds for _, seconds in paces.values() if seconds is not None]
+        left = sum(paces[cell][0] for cell in jobs if cell not in failed)
+        n_finished = len(matrix.runs) - len(queue.jobs) - len(failed)
+        to_go = seconds_to_go(seconds, left, min(workers, len(queue.jobs)))
+        yield MatrixProgress(len(matrix.runs), n_finished, len(failed), to_go)
+        if not queue.jobs:
+            return
+        time.sleep(POLL_SECONDS)
 
 
 def scores(matrix: Matrix) -> pd.DataFrame:

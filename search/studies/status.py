@@ -1,7 +1,6 @@
 """How far a search with the matrices in its folder is, or a benchmark. Nothing is started."""
 
 import inspect
-import math
 from collections import Counter
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.execution import driver
-from sb3_aarl.search.execution.matrix import share_left
+from sb3_aarl.search.execution.queue import pace, seconds_to_go
 from sb3_aarl.search.execution.storage import has_driver, is_locked
 from sb3_aarl.search.studies.search import stored_settings
 from sb3_aarl.search.training.folder import LOCK, RUN, partial_curve, read_outcome, read_run
@@ -50,7 +49,7 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
         outcome = read_outcome(path)
         curve = partial_curve(path) if outcome is None else outcome.curve
-        left = share_left(curve, read_run(path))
+        left, seconds = pace(read_run(path), curve)
         row = {"variant": read_about(path)["variant"], "task": path.parent.name, "done": 0, "running": 0, "failed": 0}
         if outcome is None:
             row |= {"running": is_locked(path / LOCK), "left": left}
@@ -58,12 +57,10 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
             row["failed"] = 1
         else:
             row |= {"done": 1, "score": aulc(curve)}
-        rows.append(row | ({"seconds": curve[-1].seconds / (1 - left)} if curve else {}))
+        rows.append(row | {"seconds": seconds})
     runs = pd.DataFrame(rows, columns=["variant", "task", "done", "running", "failed", "left", "score", "seconds"])
     by_variant = runs.groupby("variant", sort=False)
     table = by_variant[["done", "running", "failed"]].sum().astype(int)
     table.insert(0, "runs", by_variant.size())
     table["score"] = by_variant["score"].mean().where(by_variant["task"].nunique() == 1)
-    # A run's seconds at the pace that it had so far.
-    to_go = runs["seconds"].mean() * runs["left"].sum() / max(1, runs["running"].sum())
-    return table.reset_index(), 0.0 if runs["left"].isna().all() else None if math.isnan(to_go) else float(to_go)
+    return table.reset_index(), seconds_to_go(list(runs["seconds"].dropna()), runs["left"].sum(), int(runs["running"].sum()))

@@ -1,30 +1,19 @@
-"""Runs at an executor: ``start_run``, which every executor gets, resubmission, and an executor of this machine's processes."""
+"""Where runs are executed: ``start_run``, which every executor gets, and an executor of processes on this machine."""
 
-import logging
 import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from sb3_aarl.search.training.folder import STOP, Outcome, Run, is_finished, partial_curve, prepare_run, read_outcome, read_run
-from sb3_aarl.search.training.provenance import provenance, read_about, write_about
+from sb3_aarl.search.training.folder import Outcome, is_finished, partial_curve, read_outcome, read_run
 from sb3_aarl.search.training.run import LOCKED
-
-from sb3_aarl.callbacks import Evaluation
-
-logger = logging.getLogger(__name__)
 
 OUTPUT = "output.log"
 _thread = threading.local()  # the executor of a thread, if it is a LocalExecutor's
-
-
-class RunFailed(RuntimeError):
-    """Candidate after candidate failed; the message has the last reason."""
 
 
 class Executor(Protocol):
@@ -80,12 +69,6 @@ def _train(folder: Path) -> int:
         return process.wait()
 
 
-def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
-    """The learning curve over several seeds, as long as the shortest: environment steps and mean return of each evaluation."""
-    evaluations = zip(*curves, strict=False)
-    return [[points[0].environment_steps, float(np.mean([point.mean for point in points]))] for points in evaluations]
-
-
 class LocalExecutor(ThreadPoolExecutor):
     """Processes of this machine: each thread starts one and waits for it. Leaving the ``with`` block ends those that run."""
 
@@ -99,45 +82,3 @@ class LocalExecutor(ThreadPoolExecutor):
         for process in self.processes:
             process.kill()
         self.shutdown(wait=True, cancel_futures=True)
-
-
-class Submission:
-    """One run at an executor; resubmitted while its process is killed, or something fails that is not the run's fault."""
-
-    def __init__(self, executor: Executor, folder: Path, run: Run, retries: int):
-        self.executor = executor
-        self.folder = folder.absolute()
-        self.run = run
-        self.retries = retries
-        self.curve: list[Evaluation] = []
-        self.failure: str | None = None
-        self._over = False
-        self._submit()
-
-    def _submit(self) -> None:
-        prepare_run(self.folder, self.run)
-        write_about(self.folder, {**read_about(self.folder), "command": provenance()["command"]})
-        self.future = self.executor.submit(start_run, str(self.folder))
-
-    def stop(self) -> None:
-        """End the run at its next evaluation."""
-        (self.folder / STOP).touch()
-
-    def done(self) -> bool:
-        """Whether the run is over: then ``curve`` and ``failure`` (None, or the reason) are there."""
-        if self._over or not self.future.done():
-            return self._over
-        try:
-            result = self.future.result()
-        except Exception as error:  # of the executor: its worker or node is lost
-            reason = " ".join(f"{type(error).__name__}: {error}".split())[:500]
-            result = {"curve": [], "failure": reason, "retry": True}
-        if result["failure"] is not None and result["retry"] and self.retries > 0:
-            self.retries -= 1
-            logger.warning("%s is resubmitted: %s", self.folder, result["failure"])
-            self._submit()
-            return False
-        self.curve = [Evaluation(*row) for row in result["curve"]]
-        self.failure = result["failure"]
-        self._over = True
-        return True
