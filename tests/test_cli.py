@@ -167,8 +167,9 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(name: str, monke
 @pytest.mark.parametrize(
     ("environment", "options", "message"),
     [
-        ("Pendulum-v1", "--cpus-per-run 8", "--cpus-per-run needs --executor ray"),
-        ("Pendulum-v1", "--ray-address auto", "--ray-address needs --executor ray"),
+        ("Pendulum-v1", "--cpus-per-run 8", "--cpus-per-run has no meaning with --executor local"),
+        ("Pendulum-v1", "--ray-address auto", "--ray-address has no meaning with --executor local"),
+        ("Pendulum-v1", "--executor ray --slurm mem_gb=4", "--slurm has no meaning with --executor ray"),
         ("CartPole-v1", "", "CartPole-v1 cannot be trained"),
         ("Pendulum-v1\nstages: 3", "", "small.yml: stages"),
         ("Pendulum-v1\noverrides: {train_freq: 0}", "", "small.yml: Pendulum-v1 cannot be trained"),
@@ -239,6 +240,19 @@ def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Planted, monk
     options = "--executor ray --ray-address host:1 --cpus-per-run 2 --gpus-per-run 0.25 --generations 1"
     run("search", "small.yml", *options.split())
     assert executor.arguments == ("host:1", 2.0, 0.25) and len(executor.runs) == 2
+
+
+def test_a_search_on_slurm_passes_parameters(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_search(folder, SMALLER)
+    parameters = ["--slurm", "slurm_partition=gpu", "--slurm", "timeout_min=30", "--gpus-per-run", 1]
+    arguments = ["search", "small.yml", "--executor", "slurm", *parameters, "--generations", 1]
+    made: dict[str, object] = {}
+    monkeypatch.setattr(
+        "sb3_aarl.search.execution.slurm.SlurmExecutor", lambda *args, **named: made.update(named, args=args) or executor
+    )
+    run(*arguments)
+    assert made == {"args": (Path("runs/small/slurm"), 1, 1), "slurm_partition": "gpu", "timeout_min": 30}
+    assert len(executor.runs) == 2
 
 
 @pytest.mark.slow

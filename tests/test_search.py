@@ -19,11 +19,11 @@ from postgres import Postgres
 from program import aarl, start
 from sb3_aarl.search.cli.main import app
 from sb3_aarl.search.evolution.space import loss_of
-from sb3_aarl.search.execution.driver import Driver
-from sb3_aarl.search.execution.storage import open_storage
-from sb3_aarl.search.studies.config import load_config
-from sb3_aarl.search.studies.search import open_search, runs_of
-from tiny import SEARCH, write_search
+from sb3_aarl.search.execution.driver import SearchProgress
+from sb3_aarl.search.execution.queue import Queue
+from sb3_aarl.search.execution.storage import is_locked, open_storage
+from sb3_aarl.search.studies.search import Search
+from tiny import SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
 
 pytestmark = pytest.mark.slow
@@ -45,10 +45,7 @@ def slots(folder: Path | None, url: str | None = None) -> Slots:
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Slots:
     """Without processes, one run after the other."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    config, storage = load_config(write_search(folder, SHORT)), open_storage(folder / "runs/small")
-    study, _ = open_search(config, storage)
-    for _ in Driver(study, storage, runs_of(config), InProcess(), folder / "runs/small"):
-        pass
+    Search.from_file(write_search(folder, SHORT), folder / "runs/small").run(InProcess())
     found = slots(folder)
     assert len(found) == 6
     return found
@@ -154,26 +151,45 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 def test_a_ray_node_is_removed(tmp_path: Path, undisturbed: Slots, cluster: Any) -> None:
     from sb3_aarl.search.execution.ray import RayExecutor
 
-    config, folder = load_config(write_search(tmp_path, SHORT)), tmp_path / "runs/small"
-    storage = open_storage(folder)
-    study, _ = open_search(config, storage)
-    removed = False
+    search, removed = Search.from_file(write_search(tmp_path, SHORT), tmp_path / "runs/small"), False
+
+    def remove(progress: SearchProgress) -> None:
+        nonlocal removed
+        if not removed and progress.generations[0].filled >= 1:
+            cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+            removed = True
+
     with RayExecutor(cluster.address) as executor:
-        for progress in Driver(study, storage, runs_of(config), executor, folder, workers=2, retries=config.retries):
-            if not removed and progress.generations[0].filled >= 1:
-                cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
-                removed = True
+        search.run(executor, workers=2, on_progress=remove)
     assert removed
     assert slots(tmp_path) == undisturbed
+
+
+def test_jobs_of_submitit(tmp_path: Path, undisturbed: Slots) -> None:
+    """As processes of this machine instead of Slurm."""
+    from sb3_aarl.search.execution.slurm import SlurmExecutor
+
+    for parameters in ({"bogus": 3}, {"timeout_min": "long"}, {"cluster": "slurm"}):  # which is not installed
+        with pytest.raises(ValueError, match="submitit: "):
+            SlurmExecutor(tmp_path / "slurm", **{"cluster": "local", **parameters})
+    search = Search.from_file(write_search(tmp_path, SHORT), tmp_path / "runs/small")
+    with SlurmExecutor(tmp_path / "slurm", cluster="local") as executor:
+        search.run(executor, workers=2)
+        assert slots(tmp_path) == undisturbed
+        queue = Queue(executor)
+        queue.add(tmp_path / "long", tiny_run(checkpoints=(50_000, 100_000)))
+        queue.update()
+        wait_until(lambda: (tmp_path / "long/provenance.json").exists(), None)
+    wait_until(lambda: not is_locked(tmp_path / "long/lock"), None, 30)
 
 
 def load(folder: Path) -> optuna.Study:
     return optuna.load_study(study_name="small", storage=open_storage(folder / "runs/small", create=False))
 
 
-def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 120) -> None:
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | None, seconds: float = 120) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
-        assert process.poll() is None, process.communicate()[0]
+        assert process is None or process.poll() is None, process and process.communicate()[0]
         assert time.monotonic() < deadline
         time.sleep(0.1)

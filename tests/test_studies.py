@@ -7,15 +7,19 @@ import numpy as np
 import optuna
 import pandas as pd
 import pytest
+from executors import Planted
 from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import InMemoryStorage
 from optuna.trial import create_trial
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import distributions, loss_to_params, random_loss
 from sb3_aarl.search.evolution.surrogate import features
+from sb3_aarl.search.execution.driver import SearchProgress
 from sb3_aarl.search.execution.matrix import Cell
 from sb3_aarl.search.studies import cross_validation, operator_selection
 from sb3_aarl.search.studies.config import SearchConfig, load_config
-from sb3_aarl.search.studies.search import SETTINGS_KEY, baselines, make_pruner, open_search, runs_of
+from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, open_search, runs_of
+from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError
 from sklearn.linear_model import BayesianRidge
 from tiny import SEARCH, write_search
@@ -53,12 +57,12 @@ def add_trials(study: optuna.Study, scores: list[float]) -> None:
 
 def test_a_search_is_opened_again(config: SearchConfig, tmp_path: Path) -> None:
     storage = InMemoryStorage()
-    study, sampler = open_search(config, storage)
+    study = open_search(config, storage)
     study.enqueue_trial(loss_to_params(LOSSES[0]))
     more = {"generations": 9, "retries": 1, "overrides": {"device": "cpu"}, "pruner": "median"}
-    again, _ = open_search(config.model_copy(update=more), storage)
+    again = open_search(load_config(config.path, **more), storage)
     assert again.study_name == "small" and len(again.trials) == 1
-    assert study.direction == optuna.study.StudyDirection.MAXIMIZE and study.sampler is sampler
+    assert study.direction == optuna.study.StudyDirection.MAXIMIZE and isinstance(study.sampler, AuxLossSampler)
     assert isinstance(again.pruner, MedianPruner)
 
 
@@ -73,7 +77,7 @@ def test_a_search_is_opened_again(config: SearchConfig, tmp_path: Path) -> None:
         ({"overrides": {"batch_size": 16}}, "batch_size=8, not 16"),
         ({"population_size": 6}, "population_size=3, not 6"),
         ({"initial": (LOSSES[1],)}, r"initial=\[\], not \['{s_t, a_t} -> {r_t}'\]"),
-        ({"seed": 4}, "seed=3, not 4"),
+        ({"evolution_seed": 4}, "evolution_seed=3, not 4"),
     ],
     ids=str,
 )
@@ -81,10 +85,10 @@ def test_a_search_with_other_settings_is_another_one(
     config: SearchConfig, tmp_path: Path, changed: dict[str, Any], message: str
 ) -> None:
     storage = InMemoryStorage()
-    study, _ = open_search(config, storage)
+    study = open_search(config, storage)
     stored = study.user_attrs
     with pytest.raises(ValueError, match=f"this (search: it|study) was started with {message}"):
-        open_search(config.model_copy(update=changed), storage)
+        open_search(load_config(config.path, **changed), storage)
     assert optuna.load_study(study_name="small", storage=storage).user_attrs == stored
 
 
@@ -99,6 +103,43 @@ def test_a_study_of_another_kind_is_refused_and_stays_as_it_is(config: SearchCon
     with pytest.raises(ValueError, match="'small' is not this search: it has trials of another program"):
         open_search(config, storage)
     assert SETTINGS_KEY not in study.user_attrs
+
+
+def test_a_search_from_python(config: SearchConfig, tmp_path: Path, executor: Planted) -> None:
+    with pytest.raises(ConfigError, match=r"small.yml: Pendulum-v1 cannot be trained"):
+        Search.from_file(config.path, overrides={"stats_window_size": -1})
+    search = Search.from_file(config.path, tmp_path / "mine", generations=1)
+    assert not (tmp_path / "mine").exists()
+    progresses: list[SearchProgress] = []
+    last = search.run(executor, workers=2, on_progress=progresses.append)
+    assert progresses[-1] == last and [generation.filled for generation in last.generations] == [3]
+    assert last.best == search.study.best_value == 1.0 and last.seconds_to_go == 0
+    # It is resumed by another program, with more generations; other searches are refused.
+    more = Search.from_file(config.path, tmp_path / "mine")
+    assert [generation.filled for generation in more.run(executor).generations] == [3, 3]
+    assert len(executor.runs) == 6
+    (tmp_path / "other.yml").write_text(config.path.read_text())
+    with pytest.raises(ValueError, match="mine is the folder of the search small"):
+        Search.from_file(tmp_path / "other.yml", tmp_path / "mine").run(executor)
+
+
+def test_a_file_is_read_once_and_its_settings_are_checked_once(
+    config: SearchConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor: Planted
+) -> None:
+    read, checked = [], []
+
+    def count(name: str, calls: list[Any]) -> None:
+        function = getattr(training, name)
+        monkeypatch.setattr(training, name, lambda *arguments: calls.append(arguments) or function(*arguments))
+
+    count("read_yaml", read)
+    count("check_hyperparameters", checked)
+    search = Search.from_file(config.path, tmp_path / "mine", generations=1)
+    search.run(executor)
+    baselines(search.config, tmp_path)
+    assert [Path(path).name for (path,) in read] == ["small.yml", "hyperparameters.yml"]
+    # Two environments, and the overrides of a baseline.
+    assert len(checked) == 3
 
 
 def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None:
@@ -128,7 +169,7 @@ def test_baselines_have_the_settings_of_the_search_and_their_own(config: SearchC
 
 
 def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    study, _ = open_search(config, InMemoryStorage())
+    study = open_search(config, InMemoryStorage())
     with pytest.raises(ValueError, match="no completed candidate"):
         cross_validation.make_matrix(config, study, tmp_path)
     add_trials(study, [5.0, 9.0, 8.0])
@@ -157,11 +198,11 @@ def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, capl
 def test_a_file_that_differs_from_its_study_is_not_cross_validated(
     config: SearchConfig, tmp_path: Path, changed: dict[str, Any]
 ) -> None:
-    study, _ = open_search(config, InMemoryStorage())
+    study = open_search(config, InMemoryStorage())
     add_trials(study, [5.0, 9.0, 8.0])
     (key,) = changed.get("overrides", changed)
     with pytest.raises(ValueError, match=f"study 'small' is not this search: it was started with {key}="):
-        cross_validation.make_matrix(config.model_copy(update=changed), study, tmp_path)
+        cross_validation.make_matrix(load_config(config.path, **changed), study, tmp_path)
 
 
 def test_finalists_that_the_surrogate_rates_highest() -> None:

@@ -38,7 +38,7 @@ n_prior: 1
 population_size: 3
 parents: 0.5
 max_horizon: 3
-seed: 3
+evolution_seed: 3
 retries: 50
 """
 

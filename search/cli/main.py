@@ -12,7 +12,7 @@ from sb3_aarl.search.cli.console import errors
 from typer.core import TyperGroup
 
 # Training alone does without these modules; the extra that has them.
-EXTRAS = {"imageio": "search", "psycopg": "postgres", "ray": "ray"}
+EXTRAS = {"imageio": "search", "psycopg": "postgres", "ray": "ray", "submitit": "slurm"}
 OF_SEARCH = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "plotly", "scipy", "sklearn", "sqlalchemy", "tenacity")
 
 

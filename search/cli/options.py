@@ -1,6 +1,5 @@
 """Options that several commands have, and the folders and studies that they name."""
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,8 +10,6 @@ from typer import Argument, Option
 if TYPE_CHECKING:
     from optuna import Study
     from sb3_aarl.search.studies.config import SearchConfig
-
-logger = logging.getLogger(__name__)
 
 SearchFile = Annotated[
     Path,
@@ -59,19 +56,9 @@ def modules(imports: str) -> list[str]:
 
 def read_config(path: Path, **changes: Any) -> "SearchConfig":
     """The configuration of a search, with the values of options over those of its file; that its runs can start is checked."""
-    from sb3_aarl.search.studies.config import load_config
-    from sb3_aarl.search.studies.search import make_run
-    from sb3_aarl.search.training.setup import check_run
+    from sb3_aarl.search.studies.search import Search
 
-    from sb3_aarl import catalog
-
-    config = load_config(path).model_copy(update={key: value for key, value in changes.items() if value is not None})
-    run = make_run(config, config.environment, catalog.load("forward-dynamics"), config.seeds[0])
-    setup = check_run(run, str(path))
-    if setup.episode_steps is not None and setup.episode_steps < (horizon := config.max_horizon * setup.action_repeat):
-        message = "max_horizon is %d environment steps, episodes have %d: losses of longer horizons are never trained"
-        logger.warning(message, horizon, setup.episode_steps)
-    return config
+    return Search.from_file(path, **changes).config
 
 
 def run_folder(config: Path, folder: Path | None) -> Path:

@@ -4,7 +4,7 @@ import logging
 import math
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -106,12 +106,12 @@ class Driver:
             reraise=True,
         )
 
-    def __iter__(self) -> Iterator[SearchProgress]:
+    def __iter__(self) -> Generator[SearchProgress]:
         self.folder.mkdir(parents=True, exist_ok=True)
         with driver_lock(self.storage, self.study.study_name, self.folder):
             yield from self._run()
 
-    def _run(self) -> Iterator[SearchProgress]:
+    def _run(self) -> Generator[SearchProgress]:
         try:
             self._patiently(self._interrupt_unknown)
             while True:

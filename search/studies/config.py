@@ -12,6 +12,7 @@ from pydantic import (
     NonNegativeInt,
     PlainValidator,
     PositiveInt,
+    PrivateAttr,
     ValidationInfo,
     field_validator,
 )
@@ -96,7 +97,7 @@ class Baseline(BaseModel, frozen=True, extra="forbid"):
 
 class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     """
-    A search. Defaults are the paper's. The arguments from ``population_size`` to ``seed`` are those of ``AuxLossSampler``.
+    A search. Defaults are the paper's. What follows from ``population_size`` to ``screening`` is as in ``AuxLossSampler``.
 
     :param path: The file that it was read from
     :param imports: Modules that are imported first, such as those that register environments
@@ -108,7 +109,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     :param generations: Number of generations of the evolution (the paper's "stages")
     :param initial: A loss, by notation or name, or a list of losses. ``published`` and ``handcrafted`` are all losses of that
         kind in the search space, a path to a YAML file (relative to the file of the search) is its ``aux_loss``
-    :param seed: Seed of the evolution
+    :param evolution_seed: Seed of the sampler
     :param seeds: Seeds of the runs of every candidate, whose score is the mean over them
     :param retries: How often a run that was killed is submitted again
     :param threads: PyTorch's threads of a run; they change the last bits of a result
@@ -140,7 +141,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     allow_duplicates: bool = False
     screening: PositiveInt = 1
     initial: tuple[AuxLoss, ...] = ()
-    seed: NonNegativeInt = 0
+    evolution_seed: NonNegativeInt = 0
     seeds: Seeds = (0,)
     retries: NonNegativeInt = 3
     threads: PositiveInt = 1
@@ -149,6 +150,9 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     operator_selection: OperatorSelection | None = None
     baselines: tuple[Baseline, ...] = ()
     overrides: Overrides = {}
+    # The file of hyper-parameters as it was read once, and what it means for an environment and a baseline.
+    _file: dict[str, Any] = PrivateAttr(default_factory=dict)
+    _checked: dict[tuple[str, str | None], dict[str, Any]] = PrivateAttr(default_factory=dict)
 
     @field_validator("hyperparameters")
     @classmethod
@@ -184,30 +188,46 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
 
     def hyperparameters_for(self, environment: str, baseline: Baseline | None = None) -> dict[str, Any]:
         """The hyper-parameters of a run on an environment, with a baseline's overrides merged over them."""
-        settings = {} if self.hyperparameters is None else training.load_hyperparameters(self.hyperparameters, environment)
-        merged = training.merge(settings, self.overrides)
-        if baseline is not None:
-            merged = training.merge(merged, baseline.overrides)
-        source = f"{self.path}: {'' if baseline is None else f'baseline {baseline.name}: '}overrides"
-        return training.check_hyperparameters(merged, environment, source)
+        key = environment, None if baseline is None else baseline.name
+        if key not in self._checked:
+            if baseline is None:
+                values, overrides, of_whom = self._entry(environment), self.overrides, ""
+            else:
+                values, overrides = self.hyperparameters_for(environment), baseline.overrides
+                of_whom = f"baseline {baseline.name}: "
+            if overrides:
+                merged = training.merge(values, overrides)
+                values = training.check_hyperparameters(merged, environment, f"{self.path}: {of_whom}overrides")
+            self._checked[key] = values
+        return dict(self._checked[key])
+
+    def _entry(self, environment: str) -> dict[str, Any]:
+        if self.hyperparameters is None:
+            return {}
+        if not self._file:
+            self._file.update(training.read_yaml(self.hyperparameters))
+        return training.entry_of(self._file, environment, str(self.hyperparameters))
 
     def sampler_settings(self) -> dict[str, Any]:
         """The arguments of ``AuxLossSampler``, the number of generations included."""
         names = [name for name in inspect.signature(AuxLossSampler).parameters if name in type(self).model_fields]
-        return {"n_generations": self.generations, **{name: getattr(self, name) for name in names}}
+        others = {"n_generations": self.generations, "seed": self.evolution_seed}
+        return {**others, **{name: getattr(self, name) for name in names}}
 
 
-def load_config(path: str | Path) -> SearchConfig:
+def load_config(path: str | Path, **changes: Any) -> SearchConfig:
     """
     Read a search's configuration, and check all that can be checked without training.
 
     :param path: The YAML file
+    :param changes: Values over those of the file, unless they are None
     :raises ConfigError: naming the file and the key that is wrong
     """
     values = training.read_yaml(path)
     if "path" in values:
         raise ConfigError(f"{path}: path: unknown key")
-    config = training.validated(SearchConfig, {**values, "path": str(path)}, str(path))
+    values |= {"path": str(path)} | {key: value for key, value in changes.items() if value is not None}
+    config = training.validated(SearchConfig, values, str(path))
     try:
         AuxLossSampler(**config.sampler_settings())
     except ValueError as error:

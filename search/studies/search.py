@@ -1,22 +1,32 @@
 """The search for auxiliary losses (paper, sections 2.2 and 3): its study, its sampler and the runs of its candidates."""
 
 import json
+import logging
 from collections.abc import Callable, Sequence
+from contextlib import closing
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import optuna
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
-from optuna.storages import BaseStorage
+from optuna.storages import BaseStorage, RDBStorage
 from optuna.study import StudyDirection
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.execution.driver import Driver, SearchProgress
+from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.matrix import Cell, Matrix
-from sb3_aarl.search.studies.config import Baseline, SearchConfig
+from sb3_aarl.search.execution.storage import open_storage
+from sb3_aarl.search.studies.config import Baseline, SearchConfig, load_config
 from sb3_aarl.search.training.folder import FREE, Run, differences
+from sb3_aarl.search.training.setup import check_run
 
+from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
+
+logger = logging.getLogger(__name__)
 
 SETTINGS_KEY = "settings"  # user attribute of a study
 # Settings that may change when a search is resumed, beside those of its runs.
@@ -59,7 +69,85 @@ def all_runs(config: SearchConfig) -> list[Run]:
     return [run] * sum(len(operations(number + 1)) for number in range(config.generations)) * len(config.seeds)
 
 
-def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Study, AuxLossSampler]:
+class Search:
+    """
+    A search, where its study is, and where its runs are::
+
+        search = Search.from_file("own.yml")
+        with LocalExecutor(workers=2) as executor:
+            search.run(executor, workers=2)
+        print(search.study.best_trial.user_attrs["loss"])
+
+    :param config: Its configuration
+    :param folder: Folder of its runs; None for ``runs/`` and its name
+    :param storage: URL of a database, None for SQLite in the folder
+    """
+
+    def __init__(self, config: SearchConfig, folder: Path | None = None, storage: str | None = None):
+        self.config = config
+        self.folder = Path("runs") / config.name if folder is None else folder
+        self.url = storage
+
+    @classmethod
+    def from_file(cls, path: str | Path, folder: Path | None = None, storage: str | None = None, **changes: Any) -> "Search":
+        """
+        Read a configuration, and try out a run of a candidate.
+
+        :param path: The YAML file
+        :param folder: Folder of its runs; None for ``runs/`` and the name of the file
+        :param storage: URL of a database, None for SQLite in the folder
+        :param changes: Values over those of the file, unless they are None
+        :raises ConfigError: naming the file, when it cannot be used, or no run can be trained
+        """
+        search = cls(load_config(path, **changes), folder, storage)
+        search.check()
+        return search
+
+    def check(self) -> None:
+        """Try out a run of a candidate."""
+        config = self.config
+        run = make_run(config, config.environment, catalog.load("forward-dynamics"), config.seeds[0])
+        setup = check_run(run, str(config.path))
+        if setup.episode_steps is not None and setup.episode_steps < (longest := config.max_horizon * setup.action_repeat):
+            message = "max_horizon is %d environment steps, episodes have %d: losses of longer horizons are never trained"
+            logger.warning(message, longest, setup.episode_steps)
+
+    @cached_property
+    def storage(self) -> RDBStorage:
+        """Where its study is; SQLite's file is made if it is not there."""
+        return open_storage(self.folder, self.url)
+
+    @cached_property
+    def study(self) -> optuna.Study:
+        """Its study, which is made if it is not there; a ``ValueError`` names the setting that differs if it is another's."""
+        names = optuna.get_all_study_names(self.storage) if self.url is None else []
+        if others := ", ".join(name for name in names if name != self.config.name):
+            raise ValueError(f"{self.folder} is the folder of the search {others}: choose another folder (--folder)")
+        return open_search(self.config, self.storage)
+
+    def run(
+        self, executor: Executor, workers: int = 1, on_progress: Callable[[SearchProgress], object] = lambda progress: None
+    ) -> SearchProgress:
+        """
+        Start or resume it, and return when it is over.
+
+        :param executor: Where runs are executed
+        :param workers: Runs that are at the executor at the same time
+        :param on_progress: Called about twice a second
+        :raises RunFailed: after ten candidates that failed one after the other
+        """
+        from sb3_aarl.search.results.dashboard import annotator  # which takes seconds to import
+
+        runs, retries = runs_of(self.config), self.config.retries
+        with annotator(self.study, self.folder) as annotate:
+            driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, annotate)
+            with closing(iter(driver)) as progresses:
+                for progress in progresses:
+                    on_progress(progress)
+        return progress
+
+
+def open_search(config: SearchConfig, storage: BaseStorage) -> optuna.Study:
     """
     Create or load the study of a search, with its sampler.
 
@@ -79,7 +167,7 @@ def open_search(config: SearchConfig, storage: BaseStorage) -> tuple[optuna.Stud
         raise ValueError(f"study {study.study_name!r} is not this search: it has trials of another program. {ADVICE}")
     sampler.progress(study)  # which refuses a study with other settings of the sampler
     study.set_user_attr(SETTINGS_KEY, settings(config))
-    return study, sampler
+    return study
 
 
 def make_pruner(config: SearchConfig) -> BasePruner:
@@ -104,7 +192,12 @@ def settings(config: SearchConfig) -> dict[str, Any]:
     """What decides the scores of a search, in plain values as they are read from JSON; the sampler stores what it does."""
     run = make_run(config, config.environment, None, 0)
     values = run.model_dump(exclude={"aux_loss", "hyperparameters", "keep_model", "seed"})
-    values |= {"seed": config.seed, "seeds": config.seeds, "n_generations": config.generations, "pruner": config.pruner}
+    values |= {
+        "evolution_seed": config.evolution_seed,
+        "seeds": config.seeds,
+        "n_generations": config.generations,
+        "pruner": config.pruner,
+    }
     return json.loads(json.dumps(values | run.hyperparameters))
 
 
