@@ -19,7 +19,7 @@ DEMO := dmc,search
 demo: $(VENV)/.installed
 	$(BIN)/aarl search zoo_configs/search/demo.yml --workers 2
 	$(BIN)/aarl cross-validate zoo_configs/search/demo.yml --workers 2
-	$(BIN)/aarl train cheetah-run --config zoo_configs/demo.yml --aux-loss runs/demo/winner.yml --folder runs/demo/winner
+	$(BIN)/aarl train cheetah-run --hyperparams zoo_configs/demo.yml --aux-loss runs/demo/winner.yml --folder runs/demo/winner
 	$(BIN)/aarl report runs/demo
 
 test: $(VENV)/.installed-dev system
@@ -33,7 +33,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	mkdir -p build/types/sb3_aarl
 	ln -sfn $(CURDIR)/sb3_aarl/* $(CURDIR)/search $(CURDIR)/zoo_configs build/types/sb3_aarl/
-	cd build/types && $(abspath $(BIN))/mypy --config-file $(CURDIR)/pyproject.toml -p sb3_aarl
+	cd build/types && $(abspath $(BIN))/mypy --hyperparams-file $(CURDIR)/pyproject.toml -p sb3_aarl
 	$(BIN)/mypy benchmarks results
 
 docs: $(VENV)/.installed-docs

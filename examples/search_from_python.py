@@ -12,14 +12,10 @@ import os
 from pathlib import Path
 
 import gymnasium as gym
-import optuna
-from sb3_aarl.search.evolution.sampler import AuxLossSampler
-from sb3_aarl.search.execution.driver import Driver
 from sb3_aarl.search.execution.executors import LocalExecutor
-from sb3_aarl.search.execution.storage import open_storage
-from sb3_aarl.search.training.run import Run
+from sb3_aarl.search.studies.config import SearchConfig
+from sb3_aarl.search.studies.search import Search
 
-FOLDER = Path("runs/examples/search")
 HYPERPARAMETERS = {"learning_starts": 100, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}
 # A pendulum on Mars. Any class of environments will do in place of Gymnasium's own.
 ENVIRONMENT, ENTRY_POINT = "MarsPendulum-v0", "gymnasium.envs.classic_control:PendulumEnv"
@@ -34,17 +30,21 @@ class Announcing(LocalExecutor):
 
 
 def main(steps: int) -> None:
-    def make_runs(loss):
-        settings = {"environment": ENVIRONMENT, "hyperparameters": HYPERPARAMETERS, "imports": ("search_from_python",)}
-        checkpoints = (steps // 2, steps)
-        return [Run(aux_loss=str(loss), seed=0, checkpoints=checkpoints, evaluation_episodes=3, **settings)]
-
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # where runs, processes of their own, find this file
-    sampler = AuxLossSampler(population_size=2, n_random=2, n_prior=0, n_generations=2, seed=0)
-    storage = open_storage(FOLDER)
-    study = optuna.create_study(study_name="mars", storage=storage, sampler=sampler, direction="maximize", load_if_exists=True)
+    config = SearchConfig(
+        path="mars",  # the name of the study; Search.from_file reads a configuration from a file instead
+        environment=ENVIRONMENT,
+        imports=("search_from_python",),
+        checkpoints=(steps // 2, steps),
+        evaluation_episodes=3,
+        overrides=HYPERPARAMETERS,
+        generations=2,
+        population_size=2,
+        n_random=2,
+        n_prior=0,
+    )
     with Announcing(workers=2) as executor:
-        *_, progress = Driver(study, storage, make_runs, executor, FOLDER, workers=2)
+        progress = Search(config, Path("runs/examples/search")).run(executor, workers=2)
     for generation in progress.generations:
         print(generation)
     print(f"Best: {progress.best_loss}, score {progress.best:.0f}")

@@ -71,7 +71,7 @@ def run(*arguments: object, code: int = 0) -> str:
 def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
     (folder / "own.yml").write_text(YAML + "  n_timesteps: 205\n")
     (folder / "winner.yml").write_text(yaml.safe_dump({"aux_loss": LOSSES[0]}))
-    options = "--aux-loss winner.yml --config own.yml --evaluations 2 --episodes 1"
+    options = "--aux-loss winner.yml --hyperparams own.yml --evaluations 2 --episodes 1"
     arguments = ["train", "Pendulum-v1", *options.split(), "--seed", "4"]
     shown = run(*arguments)
     (path,) = Path("runs").iterdir()
@@ -101,15 +101,15 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
         (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "'q_t' is no token"),
         (["Pendulum-v1"], "how many steps"),
         (["Pendulum-v1", "--steps", "3", "--evaluations", "5"], "too few"),
-        (["Pendulum-v1", "--config", "simba/sac_simbaa"], "nearest: simba/sac_simba"),
+        (["Pendulum-v1", "--hyperparams", "simba/sac_simbaa"], "nearest: simba/sac_simba"),
         (["CartPole-v1", "--steps", "1000"], "CartPole-v1 cannot be trained"),
     ],
     ids=["environment", "module", "name", "notation", "no steps", "steps", "file", "actions"],
 )
 def test_errors_of_train_are_one_line(arguments: list[str], message: str, folder: Path) -> None:
     write_search(folder)
-    if "--config" not in arguments:
-        arguments = [*arguments, "--config", "hyperparameters.yml"]
+    if "--hyperparams" not in arguments:
+        arguments = [*arguments, "--hyperparams", "hyperparameters.yml"]
     assert message in run("train", *arguments, code=2)
     assert not Path("runs").exists()
 

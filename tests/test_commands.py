@@ -137,7 +137,7 @@ def test_a_file_that_is_there_wins(folder: Path) -> None:
         ("search dmo", "demo"),
         ("baselines cheetah_run_sate", "cheetah_run_state"),
         ("benchmark arl_state --envs cheetah-run", "aarl_state"),
-        ("train cheetah-run --config sac_simbaa", "simba/sac_simba"),
+        ("train cheetah-run --hyperparams sac_simbaa", "simba/sac_simba"),
     ],
 )
 def test_an_unknown_name_has_the_nearest(arguments: str, nearest: str) -> None:

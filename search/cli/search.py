@@ -80,7 +80,7 @@ def search(
         from sb3_aarl.search.execution.slurm import SlurmExecutor
 
         parameters = (item.partition("=")[::2] for item in slurm or [])
-        options_of_jobs = {name: int(value) if value.isdigit() else value for name, value in parameters}
+        options_of_jobs: dict[str, Any] = {name: int(value) if value.isdigit() else value for name, value in parameters}
         running = SlurmExecutor(path / "slurm", cpus, int(gpus), **options_of_jobs)
     else:
         from sb3_aarl.search.execution.executors import LocalExecutor

@@ -26,7 +26,7 @@ def train(
         str | None,
         typer.Option(help="Notation, name, YAML file of a winner, 'none' or 'auto'. Default: the file's, or auto."),
     ] = None,
-    config: Annotated[
+    hyperparams: Annotated[
         Path | None,
         typer.Option(help=f"Hyper-parameters: {SHIPPED}. Default: aarl_state for DeepMind Control, default for others."),
     ] = None,
@@ -56,7 +56,7 @@ def train(
 
     # A job's log has no place for a bar.
     bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
-    path = prepare_one(env, aux_loss, config, steps, evaluations, episodes, seed, threads, folder, modules(imports))
+    path = prepare_one(env, aux_loss, hyperparams, steps, evaluations, episodes, seed, threads, folder, modules(imports))
     if is_finished(path):
         errors.print(f"{path} is finished: this is its result")
     else:
@@ -102,7 +102,7 @@ def configs(
     """List the configurations that come with the package, for commands that take a file."""
     from sb3_aarl.search.training.shipped import shipped_files
 
-    kinds = {"Hyper-parameters: aarl train --config NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
+    kinds = {"Hyper-parameters: aarl train --hyperparams NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
     found = {
         title: {name: first_sentence(path) for name, path in files.items() if every or "/" not in name}
         for title, files in ((title, shipped_files(searches)) for title, searches in kinds.items())

@@ -25,7 +25,7 @@ from sb3_aarl.envs import PREFIX
 def prepare_one(
     environment: str,
     aux_loss: str | None,
-    config: str | Path | None,
+    hyperparams: str | Path | None,
     environment_steps: int | None = None,
     n_evaluations: int = 5,
     evaluation_episodes: int = 10,
@@ -36,13 +36,13 @@ def prepare_one(
 ) -> Path:
     """
     Prepare the folder of a run with one loss, which keeps its model, for ``training.run.train``, and return it.
-    ``aux_loss=None`` is that of the file of hyper-parameters, or ``"auto"``; ``"none"`` is none.
+    ``aux_loss=None`` is that of the file ``hyperparams``, or ``"auto"``; ``"none"`` is none.
     """
     import_modules(imports)
     environment = resolve_env_id(environment)
-    file = find_file(Path(config or ("aarl_state" if environment.startswith(PREFIX) else "default")))
+    file = find_file(Path(hyperparams or ("aarl_state" if environment.startswith(PREFIX) else "default")))
     hyperparameters = load_hyperparameters(file, environment)
-    if config is None:
+    if hyperparams is None:
         hyperparameters.pop("policy", None)  # the one that fits the observations
     from_file = hyperparameters.pop("aux_loss", "auto")
     named = loss = from_file if aux_loss is None else aux_loss
