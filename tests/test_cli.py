@@ -15,9 +15,9 @@ from executors import Planted
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState, create_trial
 from sb3_aarl.search.cli.main import app
-from sb3_aarl.search.cli.options import read_config
 from sb3_aarl.search.evolution.space import distributions, loss_to_params
 from sb3_aarl.search.execution.storage import open_storage
+from sb3_aarl.search.studies.search import Search
 from sb3_aarl.search.training.shipped import ZOO
 from tiny import SEARCH, YAML, write_search
 from typer.testing import CliRunner
@@ -189,7 +189,7 @@ def test_what_cannot_be_searched_is_refused_before_anything_is_made(
 
 def test_a_search_warns_of_horizons_that_no_episode_has(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_search(folder, SEARCH + "overrides: {env_kwargs: {action_repeat: 100}}\n")
-    read_config(Path("small.yml"))
+    Search.from_file("small.yml")
     assert "max_horizon is 300 environment steps, episodes have 200" in caplog.text
 
 

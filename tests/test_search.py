@@ -21,8 +21,9 @@ from sb3_aarl.search.cli.main import app
 from sb3_aarl.search.evolution.space import loss_of
 from sb3_aarl.search.execution.driver import SearchProgress
 from sb3_aarl.search.execution.queue import Queue
-from sb3_aarl.search.execution.storage import is_locked, open_storage
+from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.studies.search import Search
+from sb3_aarl.search.training.folder import is_running
 from tiny import SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
 
@@ -180,7 +181,7 @@ def test_jobs_of_submitit(tmp_path: Path, undisturbed: Slots) -> None:
         queue.add(tmp_path / "long", tiny_run(checkpoints=(50_000, 100_000)))
         queue.update()
         wait_until(lambda: (tmp_path / "long/provenance.json").exists(), None)
-    wait_until(lambda: not is_locked(tmp_path / "long/lock"), None, 30)
+    wait_until(lambda: not is_running(tmp_path / "long"), None, 30)
 
 
 def load(folder: Path) -> optuna.Study:

@@ -18,7 +18,7 @@ from sb3_aarl.search.execution.driver import SearchProgress
 from sb3_aarl.search.execution.matrix import Cell
 from sb3_aarl.search.studies import cross_validation, operator_selection
 from sb3_aarl.search.studies.config import SearchConfig, load_config
-from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, open_search, runs_of
+from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, runs_of
 from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError
 from sklearn.linear_model import BayesianRidge
@@ -57,10 +57,10 @@ def add_trials(study: optuna.Study, scores: list[float]) -> None:
 
 def test_a_search_is_opened_again(config: SearchConfig, tmp_path: Path) -> None:
     storage = InMemoryStorage()
-    study = open_search(config, storage)
+    study = Search(config, storage=storage).study
     study.enqueue_trial(loss_to_params(LOSSES[0]))
     more = {"generations": 9, "retries": 1, "overrides": {"device": "cpu"}, "pruner": "median"}
-    again = open_search(load_config(config.path, **more), storage)
+    again = Search(load_config(config.path, **more), storage=storage).study
     assert again.study_name == "small" and len(again.trials) == 1
     assert study.direction == optuna.study.StudyDirection.MAXIMIZE and isinstance(study.sampler, AuxLossSampler)
     assert isinstance(again.pruner, MedianPruner)
@@ -85,10 +85,10 @@ def test_a_search_with_other_settings_is_another_one(
     config: SearchConfig, tmp_path: Path, changed: dict[str, Any], message: str
 ) -> None:
     storage = InMemoryStorage()
-    study = open_search(config, storage)
+    study = Search(config, storage=storage).study
     stored = study.user_attrs
     with pytest.raises(ValueError, match=f"this (search: it|study) was started with {message}"):
-        open_search(load_config(config.path, **changed), storage)
+        _ = Search(load_config(config.path, **changed), storage=storage).study
     assert optuna.load_study(study_name="small", storage=storage).user_attrs == stored
 
 
@@ -96,12 +96,12 @@ def test_a_study_of_another_kind_is_refused_and_stays_as_it_is(config: SearchCon
     storage = InMemoryStorage()
     study = optuna.create_study(storage=storage, study_name="small")
     with pytest.raises(ValueError, match=r"directions are \['minimize'\]"):
-        open_search(config, storage)
+        _ = Search(config, storage=storage).study
     optuna.delete_study(study_name="small", storage=storage)
     study = optuna.create_study(storage=storage, study_name="small", direction="maximize")
     study.tell(study.ask({"learning_rate": optuna.distributions.FloatDistribution(0, 1)}), 0.0)
     with pytest.raises(ValueError, match="'small' is not this search: it has trials of another program"):
-        open_search(config, storage)
+        _ = Search(config, storage=storage).study
     assert SETTINGS_KEY not in study.user_attrs
 
 
@@ -169,7 +169,7 @@ def test_baselines_have_the_settings_of_the_search_and_their_own(config: SearchC
 
 
 def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    study = open_search(config, InMemoryStorage())
+    study = Search(config, storage=InMemoryStorage()).study
     with pytest.raises(ValueError, match="no completed candidate"):
         cross_validation.make_matrix(config, study, tmp_path)
     add_trials(study, [5.0, 9.0, 8.0])
@@ -198,7 +198,7 @@ def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, capl
 def test_a_file_that_differs_from_its_study_is_not_cross_validated(
     config: SearchConfig, tmp_path: Path, changed: dict[str, Any]
 ) -> None:
-    study = open_search(config, InMemoryStorage())
+    study = Search(config, storage=InMemoryStorage()).study
     add_trials(study, [5.0, 9.0, 8.0])
     (key,) = changed.get("overrides", changed)
     with pytest.raises(ValueError, match=f"study 'small' is not this search: it was started with {key}="):

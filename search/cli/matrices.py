@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from sb3_aarl.search.cli import options
 from sb3_aarl.search.cli.console import errors, live, records, say, say_json, show_costs, show_table, time_to_go
-from sb3_aarl.search.cli.options import Folder, Json, SearchFile, Storage, Threads, Workers, modules, read_config, run_folder
+from sb3_aarl.search.cli.options import Folder, Json, SearchFile, Storage, Threads, Workers, modules
 from sb3_aarl.search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -83,13 +83,13 @@ def baselines(
     from sb3_aarl.search.studies import search
     from sb3_aarl.search.studies.cross_validation import ranking
 
-    settings = read_config(config, threads=threads)
+    found = search.Search.from_file(config, folder, threads=threads)
+    settings = found.config
     if not settings.baselines:
         raise ValueError(f"{config} names no baselines")
-    path = run_folder(config, folder)
-    if (path / STUDY_FILE).exists():
-        search.check_study(load_study(open_storage(path), settings.name), settings, free=("threads",))
-    matrix = search.baselines(settings, path)
+    if (found.folder / STUDY_FILE).exists():
+        search.check_study(load_study(open_storage(found.folder), settings.name), settings, free=("threads",))
+    matrix = search.baselines(settings, found.folder)
     train_matrix(matrix, workers, settings.retries, config)
     compare(matrix, ranking, "Baselines, AULC", json)
     exit_if_failed(matrix)
@@ -101,10 +101,11 @@ def select_operator(
 ) -> None:
     """Compare the ten operators on forward dynamics, as in the paper's table 2."""
     from sb3_aarl.search.studies import operator_selection
+    from sb3_aarl.search.studies.search import Search
 
-    settings = read_config(config, threads=threads)
-    matrix = operator_selection.make_matrix(settings, run_folder(config, folder))
-    train_matrix(matrix, workers, settings.retries, config)
+    found = Search.from_file(config, folder, threads=threads)
+    matrix = operator_selection.make_matrix(found.config, found.folder)
+    train_matrix(matrix, workers, found.config.retries, config)
     compare(matrix, operator_selection.table, "Normalized returns at the last checkpoint (paper, table 2)", json)
     exit_if_failed(matrix)
 
@@ -125,9 +126,10 @@ def cross_validate(
     """Train the best candidates of a search on several environments, and write the winner as YAML."""
     from sb3_aarl.search.execution.storage import load_study, open_storage
     from sb3_aarl.search.studies import cross_validation
+    from sb3_aarl.search.studies.search import Search
 
-    settings = read_config(config, threads=threads)
-    path = run_folder(config, folder)
+    found = Search.from_file(config, folder, threads=threads)
+    settings, path = found.config, found.folder
     searched = load_study(open_storage(path, storage, create=False), settings.name)
     matrix = cross_validation.make_matrix(settings, searched, path, top, settings.baselines if with_baselines else ())
     train_matrix(matrix, workers, settings.retries, config)

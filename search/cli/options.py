@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from sb3_aarl.search.training.shipped import find_file
 from typer import Argument, Option
 
 if TYPE_CHECKING:
     from optuna import Study
-    from sb3_aarl.search.studies.config import SearchConfig
 
 SearchFile = Annotated[
     Path,
@@ -52,13 +51,6 @@ Patterns = Annotated[
 def modules(imports: str) -> list[str]:
     """The modules that ``--imports`` names."""
     return imports.split(",") if imports else []
-
-
-def read_config(path: Path, **changes: Any) -> "SearchConfig":
-    """The configuration of a search, with the values of options over those of its file; that its runs can start is checked."""
-    from sb3_aarl.search.studies.search import Search
-
-    return Search.from_file(path, **changes).config
 
 
 def run_folder(config: Path, folder: Path | None) -> Path:

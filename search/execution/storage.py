@@ -82,49 +82,31 @@ def driver_lock(storage: BaseStorage, study_name: str, folder: Path) -> Iterator
 
     :raises ValueError: when another program holds one of them
     """
+    study_id, files = storage.get_study_id_from_name(study_name), [folder / LOCK]
+    engine = storage.engine if isinstance(storage, RDBStorage) else None
+    if engine is not None and engine.name == "sqlite" and engine.url.database:
+        path = Path(engine.url.database).resolve()
+        files.append(path.with_name(f"{path.name}.{study_id}.lock"))
     with ExitStack() as stack:
-        for path in _lock_files(storage, study_name, folder):
-            try:
+        try:
+            for path in files:
                 stack.enter_context(FileLock(path, timeout=0, fallback_to_soft=False))
-            except Timeout:
-                raise ValueError(f"another program runs this search: it holds {path}") from None
-        if not stack.enter_context(_advisory_lock(storage, study_name)):
-            raise ValueError(f"another program runs this search: it holds the lock of study {study_name!r} in the database")
+        except Timeout:
+            raise ValueError(f"another program runs this search: it holds {path}") from None
+        if engine is not None and engine.name == "postgresql":
+            engine = engine.execution_options(isolation_level="AUTOCOMMIT")
+            connection = stack.enter_context(closing(engine.connect()))
+            connection.detach()  # else it would return to the pool with the lock
+            numbers = {"search": ADVISORY_LOCK, "study": study_id}
+            if not connection.scalar(text("SELECT pg_try_advisory_lock(:search, :study)"), numbers):
+                raise ValueError(f"another program runs this search: it holds the lock of {study_name!r} in the database")
         yield
 
 
 def has_driver(storage: BaseStorage, study_name: str, folder: Path) -> bool:
-    """Whether a driver holds one of the locks of a search; locks that are files are those of this machine."""
-    with _advisory_lock(storage, study_name) as is_free:
-        return not is_free or any(map(is_locked, _lock_files(storage, study_name, folder)))
-
-
-def is_locked(path: Path) -> bool:
-    """Whether a process holds a lock."""
-    if not path.exists():
-        return False
+    """Whether a driver runs: on this machine, or on any with PostgreSQL."""
     try:
-        with FileLock(path, timeout=0, fallback_to_soft=False):
+        with driver_lock(storage, study_name, folder):
             return False
-    except Timeout:
+    except ValueError:
         return True
-
-
-def _lock_files(storage: BaseStorage, study_name: str, folder: Path) -> list[Path]:
-    files = [folder / LOCK]
-    if isinstance(storage, RDBStorage) and storage.engine.name == "sqlite" and storage.engine.url.database:
-        path = Path(storage.engine.url.database).resolve()
-        files.append(path.with_name(f"{path.name}.{storage.get_study_id_from_name(study_name)}.lock"))
-    return files
-
-
-@contextmanager
-def _advisory_lock(storage: BaseStorage, study_name: str) -> Iterator[bool]:
-    """Hold PostgreSQL's lock of a study, or not: whether it was free. Other databases have none."""
-    if not isinstance(storage, RDBStorage) or storage.engine.name != "postgresql":
-        yield True
-        return
-    with closing(storage.engine.execution_options(isolation_level="AUTOCOMMIT").connect()) as connection:
-        connection.detach()  # else it would return to the pool with the lock
-        numbers = {"search": ADVISORY_LOCK, "study": storage.get_study_id_from_name(study_name)}
-        yield bool(connection.scalar(text("SELECT pg_try_advisory_lock(:search, :study)"), numbers))

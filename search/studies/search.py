@@ -11,7 +11,7 @@ from typing import Any
 
 import optuna
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
-from optuna.storages import BaseStorage, RDBStorage
+from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
@@ -80,50 +80,60 @@ class Search:
 
     :param config: Its configuration
     :param folder: Folder of its runs; None for ``runs/`` and its name
-    :param storage: URL of a database, None for SQLite in the folder
+    :param storage: A storage of Optuna, or the URL of a database; None for SQLite in the folder
     """
 
-    def __init__(self, config: SearchConfig, folder: Path | None = None, storage: str | None = None):
+    def __init__(self, config: SearchConfig, folder: Path | None = None, storage: BaseStorage | str | None = None):
         self.config = config
         self.folder = Path("runs") / config.name if folder is None else folder
-        self.url = storage
+        self._storage = storage
 
     @classmethod
-    def from_file(cls, path: str | Path, folder: Path | None = None, storage: str | None = None, **changes: Any) -> "Search":
+    def from_file(
+        cls, path: str | Path, folder: Path | None = None, storage: BaseStorage | str | None = None, **changes: Any
+    ) -> "Search":
         """
-        Read a configuration, and try out a run of a candidate.
+        Read a configuration, and try out a run of a candidate. ``changes`` are values over those of the file.
 
-        :param path: The YAML file
-        :param folder: Folder of its runs; None for ``runs/`` and the name of the file
-        :param storage: URL of a database, None for SQLite in the folder
-        :param changes: Values over those of the file, unless they are None
         :raises ConfigError: naming the file, when it cannot be used, or no run can be trained
         """
-        search = cls(load_config(path, **changes), folder, storage)
-        search.check()
-        return search
-
-    def check(self) -> None:
-        """Try out a run of a candidate."""
-        config = self.config
-        run = make_run(config, config.environment, catalog.load("forward-dynamics"), config.seeds[0])
-        setup = check_run(run, str(config.path))
+        config = load_config(path, **changes)
+        setup = check_run(make_run(config, config.environment, catalog.load("forward-dynamics"), config.seeds[0]), str(path))
         if setup.episode_steps is not None and setup.episode_steps < (longest := config.max_horizon * setup.action_repeat):
             message = "max_horizon is %d environment steps, episodes have %d: losses of longer horizons are never trained"
             logger.warning(message, longest, setup.episode_steps)
+        return cls(config, folder, storage)
 
     @cached_property
-    def storage(self) -> RDBStorage:
+    def storage(self) -> BaseStorage:
         """Where its study is; SQLite's file is made if it is not there."""
-        return open_storage(self.folder, self.url)
+        return self._storage if isinstance(self._storage, BaseStorage) else open_storage(self.folder, self._storage)
 
     @cached_property
     def study(self) -> optuna.Study:
-        """Its study, which is made if it is not there; a ``ValueError`` names the setting that differs if it is another's."""
-        names = optuna.get_all_study_names(self.storage) if self.url is None else []
-        if others := ", ".join(name for name in names if name != self.config.name):
+        """
+        Its study, which is made if it is not there.
+
+        :raises ValueError: naming the setting that differs, when it was started with others
+        """
+        config, names = self.config, optuna.get_all_study_names(self.storage) if self._storage is None else []
+        if others := ", ".join(name for name in names if name != config.name):
             raise ValueError(f"{self.folder} is the folder of the search {others}: choose another folder (--folder)")
-        return open_search(self.config, self.storage)
+        sampler = AuxLossSampler(**config.sampler_settings())
+        study = optuna.create_study(
+            storage=self.storage,
+            sampler=sampler,
+            pruner=make_pruner(config),
+            study_name=config.name,
+            direction="maximize",
+            load_if_exists=True,
+        )
+        check_study(study, config)
+        if SETTINGS_KEY not in study.user_attrs and any(trial.state != TrialState.WAITING for trial in study.trials):
+            raise ValueError(f"study {study.study_name!r} is not this search: it has trials of another program. {ADVICE}")
+        sampler.progress(study)  # which refuses a study with other settings of the sampler
+        study.set_user_attr(SETTINGS_KEY, settings(config))
+        return study
 
     def run(
         self, executor: Executor, workers: int = 1, on_progress: Callable[[SearchProgress], object] = lambda progress: None
@@ -145,29 +155,6 @@ class Search:
                 for progress in progresses:
                     on_progress(progress)
         return progress
-
-
-def open_search(config: SearchConfig, storage: BaseStorage) -> optuna.Study:
-    """
-    Create or load the study of a search, with its sampler.
-
-    :raises ValueError: naming the setting that differs, when a study of this name was started with other settings
-    """
-    sampler = AuxLossSampler(**config.sampler_settings())
-    study = optuna.create_study(
-        storage=storage,
-        sampler=sampler,
-        pruner=make_pruner(config),
-        study_name=config.name,
-        direction="maximize",
-        load_if_exists=True,
-    )
-    check_study(study, config)
-    if SETTINGS_KEY not in study.user_attrs and any(trial.state != TrialState.WAITING for trial in study.trials):
-        raise ValueError(f"study {study.study_name!r} is not this search: it has trials of another program. {ADVICE}")
-    sampler.progress(study)  # which refuses a study with other settings of the sampler
-    study.set_user_attr(SETTINGS_KEY, settings(config))
-    return study
 
 
 def make_pruner(config: SearchConfig) -> BasePruner:

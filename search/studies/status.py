@@ -11,9 +11,9 @@ from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.execution import driver
 from sb3_aarl.search.execution.queue import pace, seconds_to_go
-from sb3_aarl.search.execution.storage import has_driver, is_locked
+from sb3_aarl.search.execution.storage import has_driver
 from sb3_aarl.search.studies.search import stored_settings
-from sb3_aarl.search.training.folder import LOCK, RUN, partial_curve, read_outcome, read_run
+from sb3_aarl.search.training.folder import RUN, is_running, partial_curve, read_outcome, read_run
 from sb3_aarl.search.training.provenance import read_about
 
 from sb3_aarl.aux_loss import AuxLoss
@@ -52,7 +52,7 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
         left, seconds = pace(read_run(path), curve)
         row = {"variant": read_about(path)["variant"], "task": path.parent.name, "done": 0, "running": 0, "failed": 0}
         if outcome is None:
-            row |= {"running": is_locked(path / LOCK), "left": left}
+            row |= {"running": is_running(path), "left": left}
         elif outcome.failure is not None:
             row["failed"] = 1
         else:

@@ -126,15 +126,12 @@ class Setup:
         return SACAux(self.policy or fitting, env, **self.settings)
 
 
-def _with_schedules(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings, and those in their mappings, with functions for learning rates such as ``lin_3e-4``."""
-    read: dict[str, Any] = {}
-    for key, value in settings.items():
-        is_schedule = isinstance(value, str) and value.startswith("lin_")
-        read[key] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0) if is_schedule else value
-        if isinstance(value, Mapping):
-            read[key] = _with_schedules(value)
-    return read
+def _with_schedules(value: Any) -> Any:
+    """Settings, and the mappings in them, with functions for learning rates such as ``lin_3e-4``."""
+    if isinstance(value, Mapping):
+        return {key: _with_schedules(item) for key, item in value.items()}
+    is_schedule = isinstance(value, str) and value.startswith("lin_")
+    return LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0) if is_schedule else value
 
 
 def check_run(run: Run, source: str | None = None) -> Setup:
