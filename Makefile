@@ -33,7 +33,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	mkdir -p build/types/sb3_aarl
 	ln -sfn $(CURDIR)/sb3_aarl/* $(CURDIR)/search $(CURDIR)/zoo_configs build/types/sb3_aarl/
-	cd build/types && $(abspath $(BIN))/mypy --hyperparams-file $(CURDIR)/pyproject.toml -p sb3_aarl
+	cd build/types && $(abspath $(BIN))/mypy --config-file $(CURDIR)/pyproject.toml -p sb3_aarl
 	$(BIN)/mypy benchmarks results
 
 docs: $(VENV)/.installed-docs
