@@ -282,7 +282,7 @@ class _Slots:
             others = [other for other in self.unfinished if other != number]
             logger.warning("Trial %d is one more of generation %d: trials %s hold its slots", number, generation, others)
         (generation, slot), attempt = free[0], self.failed[free[0]]
-        key = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
+        key: dict[str, Any] = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
         key |= {"max_horizon": self.sampler.max_horizon, "operators": self.sampler.operators}
         if is_enqueued:  # an invalid one costs no attempt: the next one in the slot is drawn by its own number
             return {SLOT_KEY: {**key, "enqueued": number + 1, "operation": "enqueued", "parents": [], "loss": None}}
