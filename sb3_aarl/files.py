@@ -1,4 +1,4 @@
-"""Files of plain text: YAML of which nothing is evaluated, and files that are replaced in one step."""
+"""Text files: YAML, of which nothing is evaluated, and files that are replaced atomically."""
 
 import json
 import re
@@ -42,7 +42,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     """
     try:
         values = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
-        json.dumps(values, default=str)  # which refuses what contains itself
+        json.dumps(values, default=str)  # refuses a mapping or list that contains itself
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except yaml.MarkedYAMLError as error:
@@ -57,7 +57,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 def replace_text(path: Path, text: str) -> None:
     """
-    Write a file in one step, and make its folder: other processes may read it, or write it too, at any time.
+    Write a file atomically, and create its folder. Other processes may read or write it at any time.
 
     :param path: The file
     :param text: All of its text

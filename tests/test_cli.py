@@ -261,7 +261,7 @@ def test_a_search_in_which_all_fails_is_exit_code_1(folder: Path, executor: Plan
     monkeypatch.setattr("sb3_aarl.search.execution.driver.MAX_FAILURES", 2)
     executor.fails = lambda run: True
     output = run("search", "small.yml", code=1)
-    assert "Error: 2 candidates failed one after the other, the last one: it burst (see runs/small/candidates/" in output
+    assert "Error: 2 candidates failed in a row, the last one: it burst (see runs/small/candidates/" in output
 
 
 @pytest.fixture

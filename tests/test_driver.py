@@ -217,7 +217,7 @@ def test_failures_without_end_end_the_search(tmp_path: Path) -> None:
             while executor.pending:
                 executor.end(rng, "no space left on device", retry=True)
 
-    with pytest.raises(RunFailed, match="10 candidates failed one after the other, the last one: no space left"):
+    with pytest.raises(RunFailed, match="10 candidates failed in a row, the last one: no space left"):
         run()
 
 
@@ -236,7 +236,7 @@ def test_scores_that_are_not_finite_are_failures(
             while executor.pending:
                 executor.end(rng)
 
-    with pytest.raises(RunFailed, match=f"10 candidates failed one after the other, the last one: its mean return is {value}"):
+    with pytest.raises(RunFailed, match=f"10 candidates failed in a row, the last one: its mean return is {value}"):
         run()
     assert [trial.state for trial in search.study.trials] == [TrialState.FAIL] * 10
 

@@ -28,14 +28,14 @@ from sb3_aarl.callbacks import Evaluation, aulc
 logger = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.5
-# Candidates that fail one after the other, until something else than the candidates must be wrong.
+# So many failures in a row are no longer the candidates' fault.
 MAX_FAILURES = 10
-# How long a database that is away is waited for.
+# Seconds for which an unreachable database is tried again.
 PATIENCE_SECONDS = 600
 
 
 class RunFailed(RuntimeError):
-    """Candidate after candidate failed; the message has the last reason."""
+    """Too many candidates failed in a row; the message has the last reason."""
 
 
 class SearchProgress(NamedTuple):
@@ -54,7 +54,7 @@ class SearchProgress(NamedTuple):
 
 @dataclass
 class RunningTrial:
-    """A trial whose runs, one for each seed, are in the queue, and how many evaluations were reported to Optuna."""
+    """A trial, its runs in the queue (one for each seed), and the number of evaluations reported to Optuna."""
 
     trial: optuna.Trial
     jobs: list[Job]
@@ -97,7 +97,7 @@ class Driver:
         self.queue = Queue(self.executor, self.workers, self.retries)
         self.running: dict[int, RunningTrial] = {}
         self.n_failures = 0
-        # A database that is away for a while fails any of the calls; all may be repeated.
+        # Any call may fail while the database is unreachable; all of them may be repeated.
         self._patiently = Retrying(
             retry=retry_if_exception(is_temporary),
             wait=wait_random_exponential(multiplier=0.5, max=30),
@@ -125,18 +125,18 @@ class Driver:
                     return
                 time.sleep(POLL_SECONDS)
         except KeyboardInterrupt as interrupt:
-            traceback.clear_frames(interrupt.__traceback__)  # of a query that it ended: its cursor would lock SQLite
+            traceback.clear_frames(interrupt.__traceback__)  # the cursor of an interrupted query would lock SQLite
             raise
         finally:
             self.running.clear()
-            self._interrupt_unknown()  # those that ran, and the one of an ask that was interrupted
+            self._interrupt_unknown()  # running trials, and that of an interrupted ask
 
     def _ask(self) -> optuna.Trial:
-        self._interrupt_unknown()  # of an ask that failed half way
+        self._interrupt_unknown()  # the trial of an ask that failed half way
         return self.study.ask()
 
     def _interrupt_unknown(self) -> None:
-        """Give up trials of a driver that was killed: their slots get the same losses again, whose folders resume."""
+        """Interrupt the trials of a driver that was killed. Their slots get the same losses again, and their runs resume."""
         for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             if trial.number not in self.running:
                 study_id = self.storage.get_study_id_from_name(self.study.study_name)
@@ -167,7 +167,7 @@ class Driver:
         self._patiently(self.on_change, trial)
 
     def _check(self, running: RunningTrial) -> None:
-        """Report what a candidate's runs have evaluated, and tell when all of them are over."""
+        """Report the evaluations of a candidate, and its result when all of its runs are over."""
         trial, jobs = running.trial, running.jobs
         is_over = all(job.is_over for job in jobs)
         curves = [job.curve if is_over else partial_curve(job.folder) for job in jobs]
@@ -193,7 +193,7 @@ class Driver:
             self._tell(trial, values=float(np.mean([aulc(curve) for curve in curves])))
 
     def _report(self, running: RunningTrial, curve: list[list[float]]) -> None:
-        """Report a step when all seeds have it."""
+        """Report the mean over the seeds of each step that all of them have evaluated."""
         trial, news = running.trial, curve[running.n_reported :]
         for steps, mean in news:
             self._patiently(trial.report, mean, int(steps))
@@ -210,7 +210,7 @@ class Driver:
         self.n_failures += 1
         if self.n_failures == MAX_FAILURES:
             where = candidate_folder(self.folder, trial)
-            raise RunFailed(f"{MAX_FAILURES} candidates failed one after the other, the last one: {reason} (see {where})")
+            raise RunFailed(f"{MAX_FAILURES} candidates failed in a row, the last one: {reason} (see {where})")
 
     def _note(self, trial: optuna.Trial, attributes: dict[str, Any]) -> None:
         for name, value in attributes.items():
@@ -224,11 +224,11 @@ class Driver:
 
 def _warn(attempt: RetryCallState) -> None:
     assert attempt.outcome is not None
-    logger.warning("The storage is tried again: %s", cause(attempt.outcome.exception()))
+    logger.warning("Retrying the database: %s", cause(attempt.outcome.exception()))
 
 
 def search_progress(study: optuna.Study, generations: list[GenerationProgress]) -> SearchProgress:
-    """How far a search is whose generations are so far."""
+    """The progress of a search with this progress of its generations."""
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     best = study.best_trial if complete else None
     seconds = [trial.duration.total_seconds() for trial in complete if trial.duration is not None]
@@ -242,12 +242,12 @@ def search_progress(study: optuna.Study, generations: list[GenerationProgress]) 
 
 
 def mean_curve(curves: Sequence[Sequence[Evaluation]]) -> list[list[float]]:
-    """The learning curve over several seeds, as long as the shortest: environment steps and mean return of each evaluation."""
+    """Environment steps and mean return over the seeds of each evaluation, as far as all seeds have it."""
     evaluations = zip(*curves, strict=False)
     return [[points[0].environment_steps, float(np.mean([point.mean for point in points]))] for points in evaluations]
 
 
 def candidate_folder(folder: Path, trial: optuna.Trial) -> Path:
-    """A candidate's folder, named after generation, slot and attempt, so that the next trial of a slot finds its runs."""
+    """The folder of a candidate. It has no trial number, so that the next trial of an interrupted slot finds it."""
     at = trial.user_attrs
     return folder / "candidates" / f"generation-{at['generation']}" / f"slot-{at['slot']:03}" / f"attempt-{at['attempt']}"

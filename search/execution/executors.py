@@ -38,7 +38,7 @@ def start_run(folder: str) -> dict[str, Any]:
     path, code = Path(folder), 0
     while not is_finished(path):
         code = _train(path)
-        if code != LOCKED:  # another process trains it, such as one that outlived its driver: its outcome is waited for
+        if code != LOCKED:  # else another process trains it: wait for its outcome
             break
     outcome = read_outcome(path)
     if outcome is None:  # it was killed, or told to stop
@@ -54,7 +54,7 @@ def _train(folder: Path) -> int:
     threads = read_run(folder).threads
     command = [sys.executable, "-m", "sb3_aarl.search.training.run", str(folder), "--end-with-stdin"]
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    # A session of its own: Ctrl-C reaches the driver only, whose end closes the pipe.
+    # In a session of its own: Ctrl-C reaches only the driver, and the end of the driver closes the pipe.
     with (
         (folder / OUTPUT).open("ab") as output,
         subprocess.Popen(
@@ -78,7 +78,7 @@ class LocalExecutor(ThreadPoolExecutor):
         self.is_closed = False
 
     def __exit__(self, *exception: Any) -> None:
-        self.is_closed = True  # for threads that are just starting a process
+        self.is_closed = True  # read by threads that are starting a process
         for process in self.processes:
             process.kill()
         self.shutdown(wait=True, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""A matrix of runs: variants x environments x seeds, each a run in a folder; what is finished is what has a complete curve."""
+"""A matrix of runs: variants x environments x seeds, each in its own folder. A run with a complete curve is finished."""
 
 import hashlib
 import json
@@ -110,7 +110,7 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
             paces[cell] = pace(job.run, partial_curve(job.folder))
             if job.failure is not None and not is_finished(job.folder):
                 failed.add(cell)
-                if not (job.folder / FAILED).exists():  # its process could not write it
+                if not (job.folder / FAILED).exists():  # its process was killed
                     replace_text(job.folder / FAILED, json.dumps({"reason": job.failure, "retry": True}) + "\n")
         seconds = [seconds for _, seconds in paces.values() if seconds is not None]
         left = sum(paces[cell][0] for cell in jobs if cell not in failed)

@@ -1,4 +1,4 @@
-"""The queue of runs of a search, or of a matrix: it submits them, resubmits them, and estimates the time to go."""
+"""The queue of runs, for searches and matrices: it submits and resubmits them, and estimates the time to go."""
 
 import logging
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ class Job:
         self.future: Any = None  # of the executor, while it is there
 
     def stop(self) -> None:
-        """End it at its next evaluation, or where it waits."""
+        """End the run at its next evaluation, or at once if it waits."""
         self.is_stopped = True
         if self.future is None:
             self.is_over = True
@@ -39,11 +39,11 @@ class Job:
 
 class Queue:
     """
-    Runs of which some are at an executor; the others wait in the order in which they were added. A run is resubmitted while
-    its process is killed, or something fails that is not its fault.
+    Runs that are submitted to an executor in the order in which they were added. A run whose process is killed, or that fails
+    for reasons outside of it, is resubmitted.
 
     :param executor: Where runs are executed
-    :param workers: Runs that are at the executor at the same time
+    :param workers: Number of runs at the executor at the same time
     :param retries: How often a run is resubmitted
     """
 
@@ -55,7 +55,7 @@ class Queue:
 
     @property
     def has_room(self) -> bool:
-        """Whether a run that is added now would be submitted at once."""
+        """Whether the next run would be submitted at once."""
         return len(self.jobs) < self.workers
 
     def add(self, folder: Path, run: Run) -> Job:
@@ -65,7 +65,7 @@ class Queue:
         return job
 
     def update(self) -> None:
-        """Take the outcomes of runs that have ended, and submit those for which there is room."""
+        """Collect the outcomes of finished runs, and submit waiting ones."""
         for job in self.jobs:
             if job.future is not None and job.future.done():
                 self._take(job)
@@ -93,7 +93,7 @@ class Queue:
 
 
 def pace(run: Run, curve: Sequence[Evaluation]) -> tuple[float, float | None]:
-    """The share of a run that is left, and the seconds that all of it takes at its pace so far, None before an evaluation."""
+    """The share of a run that is left, and the seconds of the whole run at its pace, None before its first evaluation."""
     if not curve:
         return 1.0, None
     done = curve[-1].environment_steps / run.checkpoints[-1]
@@ -102,11 +102,11 @@ def pace(run: Run, curve: Sequence[Evaluation]) -> tuple[float, float | None]:
 
 def seconds_to_go(seconds: Sequence[float], left: float, at_once: int) -> float | None:
     """
-    Estimated seconds until all runs, or candidates, are over; None while that is not known.
+    Estimated seconds until all runs (or candidates) are over, None if unknown.
 
-    :param seconds: What some of them have taken, or would take
-    :param left: How many are left, with the shares that are left of those that have started
-    :param at_once: How many run at the same time
+    :param seconds: Seconds of some of them
+    :param left: Number of those that are left, counting the remaining shares of started ones
+    :param at_once: Number of those that run at the same time
     """
     if left == 0:
         return 0.0

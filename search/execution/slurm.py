@@ -7,7 +7,7 @@ from typing import Any
 
 import submitit
 
-# submitit's own limit are five minutes. A run that reaches it is resubmitted, and resumed from its last evaluation.
+# submitit's default is five minutes. A run that reaches the limit is resubmitted, and resumes from its last evaluation.
 TIMEOUT_MIN = 24 * 60
 
 

@@ -16,7 +16,7 @@ STUDY_FILE = "study.db"
 LOCK = "driver.lock"
 # PostgreSQL's advisory locks have two numbers: this one, and that of the study.
 ADVISORY_LOCK = 5_334_225
-# Readers such as the dashboard hold up a commit of SQLite: it waits so many seconds for them.
+# Seconds for which a commit of SQLite waits for readers such as the dashboard.
 SQLITE_TIMEOUT = 120
 
 
@@ -37,7 +37,7 @@ def open_storage(folder: Path | None, url: str | None = None, create: bool = Tru
             raise ValueError(f"{folder} has no search: {path} does not exist. aarl search starts one")
         folder.mkdir(parents=True, exist_ok=True)
         url = URL.create("sqlite", database=str(path)).render_as_string()  # which quotes `?` and `%`
-    engine: dict[str, Any] = {"pool_pre_ping": True}  # a connection that a restarted server has closed is opened again
+    engine: dict[str, Any] = {"pool_pre_ping": True}  # reconnects after a restart of the server
     if url.startswith("sqlite"):
         engine = {"connect_args": {"timeout": SQLITE_TIMEOUT}}
     return RDBStorage(url, engine_kwargs=engine)
@@ -59,18 +59,18 @@ def load_study(storage: RDBStorage, name: str | None = None) -> optuna.Study:
 
 
 def cause(error: BaseException | None) -> str:
-    """The database's own message in one line; that of Optuna's ``StorageInternalError`` blames invalid data for everything."""
+    """The message of the database in one line. Optuna's own message blames invalid data for every error."""
     return str(getattr(error, "__cause__", None) or error).splitlines()[0]
 
 
 def is_temporary(error: BaseException) -> bool:
-    """Whether a database may work again on its own: it is away, starts, or another program holds it."""
+    """Whether a database may recover by itself: it is unreachable, starting, or locked by another program."""
     original = getattr(error.__cause__, "orig", None) if isinstance(error, StorageInternalError) else None
     if original is None:
         return False
     if isinstance(original, sqlite3.Error):
         return "locked" in str(original)
-    # PostgreSQL's classes: lost connection, deadlock, too many connections, shutdown. Without a server there is none.
+    # PostgreSQL's codes of lost connections, deadlocks, too many connections, shutdowns. Without a server there is no code.
     return (getattr(original, "sqlstate", None) or "08").startswith(("08", "40", "53300", "57"))
 
 

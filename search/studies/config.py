@@ -34,7 +34,7 @@ def _ascending(steps: tuple[int, ...]) -> tuple[int, ...]:
 
 def _different(items: tuple[Any, ...]) -> tuple[Any, ...]:
     if not items or len(set(items)) < len(items):
-        raise ValueError(f"must be one or more different ones, not {list(items)}")
+        raise ValueError(f"must have at least one item, and none twice, not {list(items)}")
     return items
 
 
@@ -52,7 +52,7 @@ def _loss_or_none(value: Any) -> AuxLoss | None:
 
 def _without_loss(overrides: dict[str, Any]) -> dict[str, Any]:
     if "aux_loss" in overrides:
-        raise ValueError("aux_loss is none of them: a search finds its losses, that of a baseline stands beside them")
+        raise ValueError("aux_loss cannot be overridden: a search finds losses, and a baseline has its own key aux_loss")
     return overrides
 
 
@@ -116,11 +116,11 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     :param pruner: ``none``, ``median`` or ``hyperband``
     :param cross_validation: Cross-validation, None where the configuration has none
     :param operator_selection: Operator selection, None where the configuration has none
-    :param baselines: What the candidates are compared with
+    :param baselines: Runs that the candidates are compared with
     :param overrides: Merged over the hyper-parameters of all runs
     """
 
-    # In the order of validation: what follows may use what stands before.
+    # Fields are validated in this order: validators of later ones use earlier ones.
     path: Annotated[Path, AfterValidator(Path.absolute)]
     imports: Annotated[tuple[str, ...], AfterValidator(training.import_modules)] = ()
     environment: Environment
@@ -150,7 +150,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     operator_selection: OperatorSelection | None = None
     baselines: tuple[Baseline, ...] = ()
     overrides: Overrides = {}
-    # The file of hyper-parameters as it was read once, and what it means for an environment and a baseline.
+    # The file of hyper-parameters, read once, and checked hyper-parameters by environment and baseline.
     _file: dict[str, Any] = PrivateAttr(default_factory=dict)
     _checked: dict[tuple[str, str | None], dict[str, Any]] = PrivateAttr(default_factory=dict)
 
@@ -217,7 +217,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
 
 def load_config(path: str | Path, **changes: Any) -> SearchConfig:
     """
-    Read a search's configuration, and check all that can be checked without training.
+    Read and check the configuration of a search.
 
     :param path: The YAML file
     :param changes: Values over those of the file, unless they are None

@@ -1,4 +1,4 @@
-"""What runs would cost on this machine, measured on one of each kind."""
+"""The cost of runs on this machine, measured on one of each kind."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ EPISODE_STEPS = 1000
 
 
 def measure(run: Run) -> dict[str, float]:
-    """Train a run for some seconds, and return what all of it, its evaluations included, would take here."""
+    """Train a run for some seconds, and return what the whole run would take here, evaluations included."""
     th.set_num_threads(run.threads)
     setup = Setup(run, run.environment)
     with closing(setup.training_env()) as env:

@@ -29,7 +29,7 @@ from sb3_aarl.aux_loss import AuxLoss
 logger = logging.getLogger(__name__)
 
 SETTINGS_KEY = "settings"  # user attribute of a study
-# Settings that may change when a search is resumed, beside those of its runs.
+# Settings of a search that may differ when it is resumed; those of its runs are in FREE.
 FREE_OF_SEARCH = ("n_generations", "pruner")
 ADVICE = "Another search needs a file of another name, another folder or another storage"
 
@@ -57,13 +57,13 @@ def make_run(
 
 
 def runs_of(config: SearchConfig) -> Callable[[AuxLoss], list[Run]]:
-    """What is trained for a candidate: a function from a loss to its runs, one for each training seed."""
+    """A function from a candidate's loss to its runs, one for each seed."""
     template = make_run(config, config.environment, None, config.seeds[0])
     return lambda loss: [template.model_copy(update={"aux_loss": str(loss), "seed": seed}) for seed in config.seeds]
 
 
 def all_runs(config: SearchConfig) -> list[Run]:
-    """A run for each candidate and seed of a search that never fails, all with SACAux's own loss: what it would cost."""
+    """As many runs as a search without failures has, all with SACAux's default loss, for an estimate of the cost."""
     operations = AuxLossSampler(**config.sampler_settings()).operations
     run = make_run(config, config.environment, None, config.seeds[0]).model_copy(update={"aux_loss": "auto"})
     return [run] * sum(len(operations(number + 1)) for number in range(config.generations)) * len(config.seeds)
@@ -71,7 +71,7 @@ def all_runs(config: SearchConfig) -> list[Run]:
 
 class Search:
     """
-    A search, where its study is, and where its runs are::
+    A search: its configuration, its study and the folder of its runs::
 
         search = Search.from_file("own.yml")
         with LocalExecutor(workers=2) as executor:
@@ -100,21 +100,21 @@ class Search:
         config = load_config(path, **changes)
         setup = check_run(make_run(config, config.environment, catalog.load("forward-dynamics"), config.seeds[0]), str(path))
         if setup.episode_steps is not None and setup.episode_steps < (longest := config.max_horizon * setup.action_repeat):
-            message = "max_horizon is %d environment steps, episodes have %d: losses of longer horizons are never trained"
+            message = "max_horizon is %d environment steps, episodes have %d: losses with longer horizons never have a window"
             logger.warning(message, longest, setup.episode_steps)
         return cls(config, folder, storage)
 
     @cached_property
     def storage(self) -> BaseStorage:
-        """Where its study is; SQLite's file is made if it is not there."""
+        """The storage of its study. A file of SQLite is created if it does not exist."""
         return self._storage if isinstance(self._storage, BaseStorage) else open_storage(self.folder, self._storage)
 
     @cached_property
     def study(self) -> optuna.Study:
         """
-        Its study, which is made if it is not there.
+        Its study, created if it does not exist.
 
-        :raises ValueError: naming the setting that differs, when it was started with others
+        :raises ValueError: if it was started with other settings, naming the first one
         """
         config, names = self.config, optuna.get_all_study_names(self.storage) if self._storage is None else []
         if others := ", ".join(name for name in names if name != config.name):
@@ -131,7 +131,7 @@ class Search:
         check_study(study, config)
         if SETTINGS_KEY not in study.user_attrs and any(trial.state != TrialState.WAITING for trial in study.trials):
             raise ValueError(f"study {study.study_name!r} is not this search: it has trials of another program. {ADVICE}")
-        sampler.progress(study)  # which refuses a study with other settings of the sampler
+        sampler.progress(study)  # refuses a study with other settings of the sampler
         study.set_user_attr(SETTINGS_KEY, settings(config))
         return study
 
@@ -139,10 +139,10 @@ class Search:
         self, executor: Executor, workers: int = 1, on_progress: Callable[[SearchProgress], object] = lambda progress: None
     ) -> SearchProgress:
         """
-        Start or resume it, and return when it is over.
+        Run the search to its end; if it was interrupted, resume it.
 
         :param executor: Where runs are executed
-        :param workers: Runs that are at the executor at the same time
+        :param workers: Number of runs at the executor at the same time
         :param on_progress: Called about twice a second
         :raises RunFailed: after ten candidates that failed one after the other
         """
@@ -176,7 +176,7 @@ def baselines(config: SearchConfig, folder: Path) -> Matrix:
 
 
 def settings(config: SearchConfig) -> dict[str, Any]:
-    """What decides the scores of a search, in plain values as they are read from JSON; the sampler stores what it does."""
+    """The settings that decide the scores of a search, as plain values. The sampler stores its own."""
     run = make_run(config, config.environment, None, 0)
     values = run.model_dump(exclude={"aux_loss", "hyperparameters", "keep_model", "seed"})
     values |= {
@@ -189,7 +189,7 @@ def settings(config: SearchConfig) -> dict[str, Any]:
 
 
 def stored_settings(study: optuna.Study) -> dict[str, Any]:
-    """All settings that a study was started with, those of its sampler included; none if it was made by another program."""
+    """The settings that a study was started with, its sampler's included; empty for a study of another program."""
     return AuxLossSampler.stored_settings(study) | study.user_attrs.get(SETTINGS_KEY, {})
 
 

@@ -160,7 +160,7 @@ def merge(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any
 
 
 def validated(model_class: type[Model], values: Mapping[str, Any], source: str) -> Model:
-    """A model of plain values. A number in quotes is text, a truth value is no number; a list will do for a tuple."""
+    """A model of plain values. Types are strict (a number in quotes is text), except that a list may stand for a tuple."""
     try:
         # Pydantic's strict mode takes a list for a tuple in JSON only.
         return model_class.model_validate_json(json.dumps(values, default=str), strict=True)
@@ -202,7 +202,7 @@ def _unknown_key(location: Sequence[str | int], model: Any) -> str:
 
 
 def _plain(annotation: Any) -> Any:
-    """The part of an annotation that plain YAML can say: no objects, no functions. None where nothing is left."""
+    """The part of an annotation that YAML can express, None if nothing is left."""
     if annotation == Schedule:
         return Annotated[str, Field(pattern=r"^lin_[0-9]*\.?[0-9]+([eE][-+]?[0-9]+)?$")]
     origin, arguments = get_origin(annotation), get_args(annotation)
@@ -223,7 +223,7 @@ def _arguments(function: Callable[..., Any], without: Collection[str]) -> dict[s
 
 
 def _model(name: str, kinds: Mapping[str, Any]) -> Any:
-    """A model whose keys may all be missing: defaults are those of the functions."""
+    """A model without required keys."""
     fields: Any = {key: (kind, None) for key, kind in kinds.items()}
     return create_model(name, __config__=ConfigDict(extra="forbid", allow_inf_nan=False), **fields)
 

@@ -19,7 +19,7 @@ NORMALIZE = "vecnormalize.pkl"
 FAILED = "failed.json"
 STOP = "stop"
 LOCK = "lock"
-# Hyper-parameters that do not change what is trained: the checkpoints say how long, and any device will do.
+# Hyper-parameters that may differ when a run is resumed: its length is that of the checkpoints.
 FREE = ("n_timesteps", "device")
 
 
@@ -50,7 +50,7 @@ class Run(pydantic.BaseModel, frozen=True, extra="forbid"):
 
 
 class Outcome(NamedTuple):
-    """How a run ended: its curve so far, the reason in one line if it failed, and whether a repetition may succeed."""
+    """How a run ended: its curve, the reason in one line if it failed, and whether it is worth another try."""
 
     curve: list[Evaluation]
     failure: str | None
@@ -59,7 +59,7 @@ class Outcome(NamedTuple):
 
 def prepare_run(folder: Path, run: Run) -> None:
     """
-    Make the folder of a run, or take the one that it has already. Files that ended it before are deleted.
+    Create the folder of a run, or reuse it: files that ended the run before are deleted.
 
     :raises ValueError: when the folder has another run, naming the key that differs
     """
@@ -79,7 +79,7 @@ def prepare_run(folder: Path, run: Run) -> None:
 
 
 def read_outcome(folder: Path) -> Outcome | None:
-    """How a run ended, None as long as it did not: it runs, waits, or was killed or told to stop."""
+    """How a run ended, None if it has neither finished nor failed."""
     curve = partial_curve(folder)
     if is_finished(folder):
         return Outcome(curve, None, False)

@@ -34,7 +34,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, read_curve, write_curve
 from sb3_aarl.files import replace_text
 
-# All that training a run from Python needs.
+# What is needed to train a run from Python.
 __all__ = ["Run", "check_run", "prepare_run", "train"]
 logger = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ def train(
             (folder / FAILED).unlink(missing_ok=True)
             try:
                 _train(folder, read_run(folder), progress_bar, on_evaluation)
-            except FloatingPointError:  # and so it would be from the checkpoint on
+            except FloatingPointError:  # it would fail again from the checkpoint
                 checkpoint.remove(folder)
                 raise
         checkpoint.remove(folder)

@@ -1,4 +1,4 @@
-"""What a run is trained with: environments, a model, and whether they can be made at all."""
+"""The environments and the model of a run, and a check that it can be trained."""
 
 import functools
 import inspect
@@ -46,7 +46,7 @@ TRIED_STEPS = 20
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any = None, renders: bool = False) -> gym.Env:
-    """The environment of a configuration. ``renders`` has it render if it observes no pixels, too."""
+    """The environment of a configuration. With ``renders``, it renders even if it does not observe pixels."""
     if env_id.startswith(PREFIX):
         env = make_dmc_env(env_id, **env_kwargs)
     else:
@@ -65,7 +65,7 @@ def _make_in_process(
 
 
 class Setup:
-    """What a run is trained with; its settings are from ``source``, in messages."""
+    """Environments and model of a run. Messages name ``source`` as the origin of its settings."""
 
     def __init__(self, run: Run, source: str):
         self.run = run
@@ -75,7 +75,7 @@ class Setup:
         check_checkpoints(run.checkpoints, settings, source)
         train_freq = settings.get("train_freq")
         if isinstance(train_freq, tuple) and train_freq[1] == "episode" and train_freq[0] > 1:
-            raise ConfigError(f"{source}: train_freq must be 1 episode at most: a rollout has to end at each checkpoint")
+            raise ConfigError(f"{source}: train_freq must be at most 1 episode: a rollout has to end at each checkpoint")
         settings.pop("n_timesteps", None)
         self.env_kwargs: dict[str, Any] = settings.pop("env_kwargs", None) or {}
         self.env_wrapper = settings.pop("env_wrapper", None)
@@ -136,12 +136,12 @@ def _with_schedules(value: Any) -> Any:
 
 def check_run(run: Run, source: str | None = None) -> Setup:
     """
-    Try a run out, before it is submitted: make its environment and model, train for some steps. Warn of what a user may not
-    have meant.
+    Check that a run can be trained: create its environment and model, and train for some steps. Warn about settings that are
+    probably not intended.
 
     :param run: The run
-    :param source: The file with its settings, for messages; None for the environment alone
-    :return: What it is trained with
+    :param source: The file with its settings, for messages
+    :return: Its environments and model
     :raises ConfigError: with the reason in one line, when it cannot be trained
     """
     what = f"{source or ''}: {run.environment} cannot be trained with these settings".removeprefix(": ")
@@ -162,19 +162,19 @@ def check_run(run: Run, source: str | None = None) -> Setup:
         problem = f"have {setup.episode_steps} environment steps, the horizon of {model.aux_loss} {horizon}"
         raise ConfigError(f"{what}: episodes {problem}")
     if setup.agent_steps <= learning_starts:
-        message = "%d agent steps are all random actions, nothing is learnt: learning_starts is %d"
+        message = "all %d agent steps are random actions, and nothing is learnt: learning_starts is %d"
         logger.warning(message, setup.agent_steps, learning_starts)
     apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
     if setup.episode_steps is None:
-        logger.warning("%s has no time limit: an evaluation waits until its episodes end", run.environment)
+        logger.warning("%s has no time limit: an evaluation may take very long", run.environment)
     elif apart < setup.episode_steps * setup.n_envs:
-        message = "evaluating every %d environment steps truncates episodes, which may have %d"
+        message = "evaluations every %d environment steps truncate episodes, which have up to %d steps"
         logger.warning(message, apart // setup.n_envs, setup.episode_steps)
     return setup
 
 
 def try_out(model: SACAux) -> None:
-    """Make some steps with a model, with its own actions, and gradient steps of all its parts."""
+    """Make some steps with the actions of a model, and two gradient steps."""
 
     def step(*_: Any) -> bool:
         if model.num_timesteps < TRIED_STEPS * model.n_envs:
@@ -189,7 +189,7 @@ def try_out(model: SACAux) -> None:
 def load_trained(
     path: Path, environment: str | None = None, renders: bool = False, imports: Sequence[str] = ()
 ) -> tuple[SACAux, VecEnv]:
-    """A trained model, and an environment for it: that of the run that it is from, or another one."""
+    """A trained model, and an environment for it: by default that of its run."""
     folder = path if path.is_dir() else path.parent
     model = folder / MODEL if path.is_dir() else path
     if not model.is_file():
