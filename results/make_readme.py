@@ -273,7 +273,9 @@ def commands(abouts: Iterable[dict[str, Any]]) -> Iterator[str]:
         steps, checkpoints = about["evaluations"], about["checkpoints"]
         # The interval between evaluations: the one that leads to these.
         every = [step for step in steps if sorted({*checkpoints, *range(step, steps[-1], step)}) == steps]
-        before = ["aarl", "benchmark", about["file"], "--envs", task_name(about["environment"])]
+        # Where the file was moved, its name finds it.
+        file = about["file"] if Path(about["file"]).exists() else Path(about["file"]).stem
+        before = ["aarl", "benchmark", file, "--envs", task_name(about["environment"])]
         after = ["--checkpoints", ",".join(map(str, checkpoints))]
         after += ["--every", str(every[0])] if steps != checkpoints else []
         after += ["--episodes", str(about["evaluation_episodes"]), "--threads", str(about["sessions"][-1]["threads"])]

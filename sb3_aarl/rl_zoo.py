@@ -1,7 +1,7 @@
 """
 RL-Zoo's own programs with SACAux, as ``sac_aux``, and with DeepMind Control as SACAux needs it.
 
-    python -m sb3_aarl.rl_zoo train --algo sac_aux --env dm_control/cheetah-run-v0 -conf zoo_configs/aarl_state.yml
+    python -m sb3_aarl.rl_zoo train --algo sac_aux --env dm_control/cheetah-run-v0 -conf zoo_configs/paper/aarl_state.yml
     python -m sb3_aarl.rl_zoo enjoy --algo sac_aux --env dm_control/cheetah-run-v0 -f logs
     python -m sb3_aarl.rl_zoo record_video --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
     python -m sb3_aarl.rl_zoo record_training --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
@@ -82,7 +82,7 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     known, _ = parser.parse_known_args(arguments)
     path = known.conf_file
     if path is None and known.algo == "sac_aux":
-        ours = files("sb3_aarl.zoo_configs") / "aarl_state.yml"
+        ours = files("sb3_aarl.zoo_configs") / "paper/aarl_state.yml"
         theirs = files("rl_zoo3") / "hyperparams/sac.yml"
         path = str(ours if str(known.env).startswith(PREFIX) else theirs)
         arguments = [*arguments, "-conf", path]

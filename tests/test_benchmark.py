@@ -75,7 +75,7 @@ def test_without_options_the_zoo_makes_the_papers_tables(
     number: int, variants: list[str], n_tasks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(benchmark, "check_run", lambda run, source: None)
-    matrix = load_benchmark([ZOO / f"{variant}.yml" for variant in variants])
+    matrix = load_benchmark([ZOO / "paper" / f"{variant}.yml" for variant in variants])
     assert list(dict.fromkeys(cell.variant for cell in matrix.runs)) == variants
     assert {cell.seed for cell in matrix.runs} == {*range(10)} and len(matrix.runs) == n_tasks * 10 * len(variants)
     scores = table.paper_scores(number)

@@ -127,7 +127,7 @@ def test_losses_lists_the_whole_catalogue() -> None:
 
 
 def test_all_files_are_installed() -> None:
-    assert (ZOO / "aarl_state.yml").is_file()
+    assert (ZOO / "paper/aarl_state.yml").is_file()
     settings = ConfigParser()
     settings.read(ROOT / "setup.cfg")
     data = settings["options.package_data"]

@@ -106,10 +106,9 @@ def run(*arguments: object, code: int = 0, stdout: bool = False) -> str:
     [
         ("demo", True, "search/demo.yml"),
         ("demo", False, "demo.yml"),
-        ("aarl_state.yml", False, "aarl_state.yml"),
+        ("aarl_state.yml", False, "paper/aarl_state.yml"),
         ("simba/sac_simba", False, "simba/sac_simba.yml"),
         ("sac_simba", False, "simba/sac_simba.yml"),
-        ("zoo_configs/search/demo.yml", True, "search/demo.yml"),
     ],
 )
 def test_shipped_files_have_names(name: str, searches: bool, file: str) -> None:
@@ -128,7 +127,7 @@ def test_a_file_that_is_there_wins(folder: Path) -> None:
     (folder / "aarl_state").write_text("default: {}")
     assert find_file(Path("aarl_state")).samefile(folder / "aarl_state")
     (folder / "elsewhere").mkdir()
-    assert find_file(Path("aarl_state"), folder=folder / "elsewhere") == ZOO / "aarl_state.yml"
+    assert find_file(Path("aarl_state"), folder=folder / "elsewhere") == ZOO / "paper/aarl_state.yml"
 
 
 @pytest.mark.parametrize(
@@ -137,7 +136,7 @@ def test_a_file_that_is_there_wins(folder: Path) -> None:
         ("search dmo", "demo"),
         ("baselines cheetah_run_sate", "cheetah_run_state"),
         ("benchmark arl_state --envs cheetah-run", "aarl_state"),
-        ("train cheetah-run --hyperparams sac_simbaa", "simba/sac_simba"),
+        ("train cheetah-run --hyperparams simba/sac_simbaa", "simba/sac_simba"),
     ],
 )
 def test_an_unknown_name_has_the_nearest(arguments: str, nearest: str) -> None:
@@ -147,7 +146,7 @@ def test_an_unknown_name_has_the_nearest(arguments: str, nearest: str) -> None:
 
 def test_a_search_may_name_a_shipped_file_or_none(folder: Path) -> None:
     config = load_config(write_search(folder, SEARCH.replace("hyperparameters.yml", "sac_identity")))
-    assert config.hyperparameters == ZOO / "sac_identity.yml"
+    assert config.hyperparameters == ZOO / "paper/sac_identity.yml"
     text = SEARCH.replace("hyperparameters: hyperparameters.yml\n", "overrides: {batch_size: 8}\n")
     assert load_config(write_search(folder, text)).hyperparameters_for("Pendulum-v1") == {"batch_size": 8}
 

@@ -71,7 +71,7 @@ def commands(text: str) -> list[str]:
 
 @pytest.mark.slow
 def test_readme_of_planted_runs(tmp_path: Path) -> None:
-    files = [Path("zoo_configs") / f"{name}.yml" for name in ("aarl_state", "sac_dense_mlp")]
+    files = [Path("zoo_configs/paper") / f"{name}.yml" for name in ("aarl_state", "sac_dense_mlp")]
     folder = tmp_path / "results" / "planted"
     matrix = load_benchmark(files, ["cheetah-run"], [0, 2], [100_000], 50_000, 3, folder=folder)
     runs = {}
@@ -101,7 +101,7 @@ def test_readme_of_planted_runs(tmp_path: Path) -> None:
 
 
 def test_the_papers_scores_stand_beside_variants_of_other_names() -> None:
-    matrix = load_benchmark([Path("zoo_configs/aarl_state.yml")], ["cheetah-run"], [0], [100_000])
+    matrix = load_benchmark([Path("zoo_configs/paper/aarl_state.yml")], ["cheetah-run"], [0], [100_000])
     (about,) = matrix.abouts.values()
     line, reference = make_readme["paper"]([{**about, "variant": "other"}])
     assert "cheetah-run at 100,000, 10 runs: AARL-State 472 ± 30" in line
@@ -116,7 +116,7 @@ def test_the_papers_scores_stand_beside_variants_of_other_names() -> None:
 def test_commands_have_the_interval(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkpoints: list[int], every: int | None
 ) -> None:
-    matrix = load_benchmark([Path("zoo_configs/aarl_state.yml")], ["cheetah-run"], [0, 2], checkpoints, every)
+    matrix = load_benchmark([Path("zoo_configs/paper/aarl_state.yml")], ["cheetah-run"], [0, 2], checkpoints, every)
     abouts = list(matrix.abouts.values())
     (command,) = make_readme["commands"]([{**about, "sessions": [SESSION]} for about in abouts])
     assert "--seeds 0,2" in command and ("--every" in command) is (every is not None)
@@ -135,8 +135,9 @@ def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     for folder in make_readme["folders"](RESULTS):
         for path, about in read_abouts(folder).items():
             # The hyper-parameters are those that the file still has, and no number is without its curve.
-            kept = {key: value for key, value in about.items() if key not in ("seconds", "sessions")}
-            assert "program" in about or any(other.items() <= kept.items() for other in repeated)
+            kept = {key: value for key, value in about.items() if key not in ("file", "seconds", "sessions")}
+            others = [{key: value for key, value in other.items() if key != "file"} for other in repeated]
+            assert "program" in about or any(other.items() <= kept.items() for other in others)
             steps = [point.environment_steps for point in read_curve(path / "curve.csv")]
             assert steps == (about["evaluations"] if "seconds" in about else about["evaluations"][: len(steps)])
 

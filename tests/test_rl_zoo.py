@@ -50,7 +50,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("zoo")
     small = ["-params", "learning_starts:260", "batch_size:8", "buffer_size:500"]
     settings = ["-n", "280", "--eval-freq", "135", "--eval-episodes", "2", "--device", "cpu", "--seed", "3", *small]
-    run(folder, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "aarl_state.yml"), *settings)
+    run(folder, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "paper/aarl_state.yml"), *settings)
     return folder / "logs/sac_aux/dm_control-cheetah-run-v0_1"
 
 
@@ -162,7 +162,7 @@ def test_optimizes_what_rl_zoo_optimizes_of_sac(tmp_path: Path) -> None:
     trials = ["-optimize", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1", "--sampler", "random"]
     trials += ["--pruner", "none"]  # RL-Zoo prunes failed trials; a pruner might prune the second trial
     settings = ["-n", "280", "--eval-episodes", "1", "--device", "cpu", "--seed", "3", "-params", "learning_starts:260"]
-    run(tmp_path, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "aarl_state.yml"), *trials, *settings)
+    run(tmp_path, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "paper/aarl_state.yml"), *trials, *settings)
     (report,) = (tmp_path / "logs" / "sac_aux").glob("report_*.csv")
     rows = pd.read_csv(report)
     assert list(rows["state"]) == ["COMPLETE"] * 2 and rows["value"].notna().all()
@@ -170,7 +170,7 @@ def test_optimizes_what_rl_zoo_optimizes_of_sac(tmp_path: Path) -> None:
 
 
 def test_environment_arguments_of_the_file() -> None:
-    walker = ["--algo", "sac_aux", "--env", "dm_control/walker-walk-v0", "-conf", str(ZOO / "aarl_pixel.yml")]
+    walker = ["--algo", "sac_aux", "--env", "dm_control/walker-walk-v0", "-conf", str(ZOO / "paper/aarl_pixel.yml")]
     pixels = {"pixels": True, "image_size": 100, "frame_stack": 3, "action_repeat": 2}
     arguments = with_env_kwargs([*walker, "-n", "5"])
     assert arguments[:8] == [*walker, "-n", "5"] and added(arguments) == pixels
@@ -240,6 +240,7 @@ def test_no_arguments_of_the_environment(text: str, tmp_path: Path) -> None:
 def test_a_file_is_not_needed() -> None:
     pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
     arguments = with_env_kwargs(SAC_AUX)
-    assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "aarl_state.yml" and added(arguments) == {"action_repeat": 4}
+    assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "paper/aarl_state.yml"
+    assert added(arguments) == {"action_repeat": 4}
     *_, theirs = with_env_kwargs(["--algo", "sac_aux", "--env", "Pendulum-v1"])
     assert theirs.endswith("rl_zoo3/hyperparams/sac.yml")

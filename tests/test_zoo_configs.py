@@ -18,7 +18,7 @@ from sb3_aarl import SACAux, catalog, encoders
 from sb3_aarl.envs import env_ids, make_dmc_env
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
-FILES = sorted(path for folder in ("", "choices", "body", "defaults", "simba") for path in (ZOO / folder).glob("*.yml"))
+FILES = sorted(path for path in ZOO.rglob("*.yml") if path.parent.name != "search")
 
 # Table 4: 100K steps above, 1000K below.
 EASY = (
@@ -126,12 +126,12 @@ def tasks_of(variant: str) -> tuple[str, ...]:
 
 
 def test_the_variants_are_all_there() -> None:
-    assert {path.stem for path in ZOO.glob("*.yml")} == {*VARIANTS, "forward_simba", "default", "demo", "sac"}
+    assert {path.stem for path in (ZOO / "paper").glob("*.yml")} == {*VARIANTS}
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_tables_7_and_8(variant: str) -> None:
-    path = ZOO / f"{variant}.yml"
+    path = ZOO / "paper" / f"{variant}.yml"
     ids = {f"dm_control/{task}-v0": task for task in tasks_of(variant)}
     assert yaml.safe_load(path.read_text()).keys() == {"default", *ids}
     assert ids.keys() <= set(env_ids())
@@ -192,7 +192,7 @@ def test_choices_differ_in_nothing_else() -> None:
         path = ZOO / "choices" / f"{choice}.yml"
         for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
             repeat = REPEAT_4 if variant in STATE_VARIANTS else {}
-            values = merge(load_hyperparameters(ZOO / f"{variant}.yml", env_id), repeat)
+            values = merge(load_hyperparameters(ZOO / "paper" / f"{variant}.yml", env_id), repeat)
             for name in PUBLIC_START:  # sac_identity has it, its choices are from before
                 values["policy_kwargs"].pop(name, None)
             assert load_hyperparameters(path, env_id) == merge(values, changes)
@@ -287,7 +287,7 @@ def shared_env(env_id: str, env_kwargs: tuple[tuple[str, Any], ...]) -> gym.Env:
     ],
 )
 def test_builds_and_trains(variant: str, task: str) -> None:
-    values = load_hyperparameters(ZOO / f"{variant}.yml", f"dm_control/{task}-v0")
+    values = load_hyperparameters(ZOO / "paper" / f"{variant}.yml", f"dm_control/{task}-v0")
     env = shared_env(f"dm_control/{task}-v0", tuple(values.pop("env_kwargs").items()))
     small = {"buffer_size": 30, **({"aux_batch_size": 4} if "aux_batch_size" in values else {})}
     values["policy_kwargs"]["net_arch"] = [8]

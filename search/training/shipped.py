@@ -16,16 +16,14 @@ def shipped_files(searches: bool) -> dict[str, Path]:
 
 
 def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path:
-    """A file that is there, or else the shipped one of that name, such as ``demo``, ``sac_simba``, ``simba/sac_simba``."""
+    """A file that is there, or else the shipped one of that name, such as ``demo``, ``aarl_state`` or ``paper/aarl_state``."""
     if (folder / path).is_file():
         return folder / path
     files = shipped_files(searches)
-    wanted = f"/{path.as_posix().removesuffix('.yml')}"
-    found = [
-        known for known, file in files.items() if f"/zoo_configs/{file.relative_to(ZOO).with_suffix('')}".endswith(wanted)
-    ]
-    if len(found) != 1:
-        nearest = found or difflib.get_close_matches(path.stem, files, n=1)
-        hint = f", nearest: {', '.join(nearest)}" if nearest else ""
+    by_name = {file.stem: file for file in files.values()} | files
+    name = path.as_posix().removesuffix(".yml")
+    if name not in by_name:
+        nearest = difflib.get_close_matches(name, by_name, n=1)
+        hint = f", nearest: {nearest[0]}" if nearest else ""
         raise ValueError(f"{path} is no file, nor the name of one of `aarl configs`{hint}")
-    return files[found[0]]
+    return by_name[name]
