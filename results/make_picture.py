@@ -7,7 +7,7 @@ from sb3_aarl.search.results.plots import learning_curves_plot
 from sb3_aarl.search.studies.benchmark import read_curves
 
 RESULTS = Path(__file__).parent
-FOLDERS = ("confirmation", "simba", "choices_small")
+FOLDERS = ("agent/tasks/runs", "paper/small/runs")
 # What the picture calls each variant.
 VARIANTS = {
     "forward_simba": "SACAux: forward dynamics, encoder simba",

@@ -2,37 +2,32 @@
 
 import inspect
 import itertools
-import json
 import math
-import os
 import re
 import runpy
 import shlex
 import statistics
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sb3_aarl.search.cli.main import app
-from sb3_aarl.search.execution.matrix import cell_folder, stored_scores
+from sb3_aarl.search.execution.matrix import stored_scores
 from sb3_aarl.search.execution.storage import load_study, open_storage
 from sb3_aarl.search.results.analysis import analysed, trial_table
 from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.results.statistics import interquartile_means
 from sb3_aarl.search.results.table import paper_scores, read_runs
 from sb3_aarl.search.studies import benchmark
-from sb3_aarl.search.studies.benchmark import load_benchmark, read_abouts
+from sb3_aarl.search.studies.benchmark import load_benchmark
 from sb3_aarl.search.studies.cross_validation import ranking
 from sb3_aarl.search.training.config import read_yaml
-from sb3_aarl.search.training.provenance import ABOUT
 from scipy.stats import mannwhitneyu
 from typer.testing import CliRunner
 
 from sb3_aarl import SACAux
-from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
+from sb3_aarl.callbacks import read_curve
 from sb3_aarl.catalog import resolve
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -69,37 +64,6 @@ def commands(text: str) -> list[str]:
     return [line for block in re.findall(r"```bash\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
 
 
-@pytest.mark.slow
-def test_readme_of_planted_runs(tmp_path: Path) -> None:
-    files = [Path("zoo_configs/paper") / f"{name}.yml" for name in ("aarl_state", "sac_dense_mlp")]
-    folder = tmp_path / "results" / "planted"
-    matrix = load_benchmark(files, ["cheetah-run"], [0, 2], [100_000], 50_000, 3, folder=folder)
-    runs = {}
-    for number, (cell, about) in enumerate(matrix.abouts.items()):
-        path = cell_folder(folder, cell)
-        path.mkdir(parents=True)
-        seconds = 3600.0 * (number + 1)
-        curve = [Evaluation(50_000, 10.0 * number, 1.0, 3, seconds / 2), Evaluation(100_000, 30.0 * number, 1.0, 3, seconds)]
-        write_curve(path / "curve.csv", curve)
-        runs[path] = {**about, "sessions": [SESSION], "seconds": seconds}
-        (path / ABOUT).write_text(json.dumps(runs[path]))
-    (folder / "about.md").write_text("Planted\nThe text.\n")
-
-    text = make_readme["readme"](tmp_path / "results")
-    assert "## Planted\n\nThe text.\n" in text
-    assert "100K steps scores" in text and "472 ± 30" in text  # the paper's
-    for number, path in enumerate(runs):
-        row = f"| [{path.relative_to(folder)}]({path.relative_to(folder.parent)}/curve.csv) | {30 * number:.1f} at 100,000 "
-        assert row + f"| {20 * number:.1f} | {60 * (number + 1)} | 2 | a processor | c0ffee | 2026-11-21 |" in text
-    for variant in ("aarl_state", "sac_dense_mlp"):
-        seconds_of = [about["seconds"] for about in runs.values() if about["variant"] == variant]
-        hours = sum(seconds_of) / 2 / 3600
-        # Two threads each; 725 candidates of five times as many steps in a search, which have a loss.
-        whole = f"{725 * 5 * 2 * hours:,.0f}" if variant == "aarl_state" else ""
-        shown = f"{3600 * hours:,.0f} ({min(seconds_of):,.0f} to {max(seconds_of):,.0f})"
-        assert f"| {variant} | 2 | {shown} | {2 * hours:.2f} | {whole} |" in text
-
-
 def test_the_papers_scores_stand_beside_variants_of_other_names() -> None:
     matrix = load_benchmark([Path("zoo_configs/paper/aarl_state.yml")], ["cheetah-run"], [0], [100_000])
     (about,) = matrix.abouts.values()
@@ -121,25 +85,6 @@ def test_commands_have_the_interval(
     (command,) = make_readme["commands"]([{**about, "sessions": [SESSION]} for about in abouts])
     assert "--seeds 0,2" in command and ("--every" in command) is (every is not None)
     assert abouts_of(command, tmp_path, monkeypatch) == abouts
-
-
-@pytest.mark.slow
-def test_readme_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # In a process of its own: rich's console is as wide as COLUMNS, which pytest-xdist sets, is at its import.
-    program = "import pathlib, runpy, sys; print(runpy.run_path(sys.argv[1])['readme'](pathlib.Path(sys.argv[2])), end='')"
-    command = [sys.executable, "-c", program, RESULTS / "make_readme.py", RESULTS]
-    environment = {**os.environ, "COLUMNS": "120"}
-    text = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
-    assert (RESULTS / "README.md").read_text(encoding="utf-8") == text, "python results/make_readme.py"
-    repeated = [about for command in commands(text) for about in abouts_of(command, tmp_path, monkeypatch)]
-    for folder in make_readme["folders"](RESULTS):
-        for path, about in read_abouts(folder).items():
-            # The hyper-parameters are those that the file still has, and no number is without its curve.
-            kept = {key: value for key, value in about.items() if key not in ("file", "seconds", "sessions")}
-            others = [{key: value for key, value in other.items() if key != "file"} for other in repeated]
-            assert "program" in about or any(other.items() <= kept.items() for other in others)
-            steps = [point.environment_steps for point in read_curve(path / "curve.csv")]
-            assert steps == (about["evaluations"] if "seconds" in about else about["evaluations"][: len(steps)])
 
 
 def test_mean_of_the_best_of_some_scores() -> None:
@@ -172,16 +117,16 @@ def test_a_search_found_what_its_text_says() -> None:
     text = "`{}`, is first with {:.0f}, the best evolved one second with {:.0f}, means of both tasks"
     assert text.format(ranked.index[0], *ranked[:2]) in readme
     losses = ("published", "evolved", "aarl", "forward", "sac")
-    rows = {"Cheetah-Run": [last_returns(f"{name}_simba", folder="confirmation") for name in losses]}
-    rows["Cheetah-Run, float32"] = [last_returns(f"{name}_simba_fp32", folder="confirmation_fp32") for name in losses]
+    rows = {"Cheetah-Run": [last_returns(f"{name}_simba", folder="search/confirmation") for name in losses]}
+    rows["Cheetah-Run, float32"] = [last_returns(f"{name}_simba_fp32", folder="search/confirmation_fp32") for name in losses]
     float32 = {"walker-walk": ("published", "sac"), "reacher-hard": ("published", "aarl", "sac")}
     for task, names in float32.items():
         folders = [f"{name}_simba{'_fp32' * (name in names)}" for name in losses]
-        rows[task.title()] = [last_returns(name, task, "confirmation_fp32") for name in folders]
+        rows[task.title()] = [last_returns(name, task, "search/confirmation_fp32") for name in folders]
     rows["Cheetah-Run, the paper's encoder"] = [
-        last_returns(f"{name}_dense_mlp_fp32", folder="confirmation_dense_mlp") for name in losses
+        last_returns(f"{name}_dense_mlp_fp32", folder="search/confirmation_dense_mlp") for name in losses
     ]
-    whole_size = [last_returns(name, folder="choices") for name in ("published_state", "aarl_state_bf16")]
+    whole_size = [last_returns(name, folder="paper/full_size") for name in ("published_state", "aarl_state_bf16")]
     assert min(map(min, whole_size)) > papers("AARL-State")["mean"]
     rows["Cheetah-Run, the paper's encoder and size"] = [whole_size[0], [], whole_size[1], [], []]
     for name, row in rows.items():
@@ -198,9 +143,11 @@ def test_a_search_found_what_its_text_says() -> None:
     assert not are_close(rows["Walker-Walk"][3], rows["Walker-Walk"][0])
 
 
-def last_returns(variant: str, task: str = "cheetah-run", folder: str = "choices_small") -> list[float]:
+def last_returns(variant: str, task: str = "cheetah-run", folder: str = "paper/small") -> list[float]:
     """Returns of the last evaluations, one for each seed."""
-    curves = sorted((RESULTS / folder / variant / task).glob("seed-*/curve.csv"))
+    curves = sorted((RESULTS / folder / "runs" / variant / task).glob("seed-*/curve.csv"))
+    for other in ("agent/tasks", "agent/parts"):  # where runs are that several experiments show
+        curves = curves or sorted((RESULTS / other / "runs" / variant / task).glob("seed-*/curve.csv"))
     return [read_curve(curve)[-1].mean for curve in curves]
 
 
@@ -301,11 +248,13 @@ def test_defaults_are_what_was_decided() -> None:
 def test_figures_of_the_first_readme() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
 
-    def by_task(variant: str, folder: str = "simba") -> dict[str, list[float]]:
-        return {path.name: last_returns(variant, path.name, folder) for path in (RESULTS / folder / variant).iterdir()}
+    def by_task(variant: str, folder: str = "agent/tasks") -> dict[str, list[float]]:
+        return {
+            path.name: last_returns(variant, path.name, folder) for path in (RESULTS / folder / "runs" / variant).iterdir()
+        }
 
-    sac = by_task("sac_states", "confirmation") | by_task("sac_starts_5000")
-    forward = {"cheetah-run": last_returns("forward_simba", folder="simba_cheetah_run"), **by_task("forward_simba")}
+    sac = by_task("sac_states") | by_task("sac_starts_5000")
+    forward = by_task("forward_simba")
     means = [statistics.mean(returns["cheetah-run"]) for returns in (forward, sac)]
     assert "its return is {:.0f} where SAC's is {:.0f}.".format(*means) in readme
     for task, returns in forward.items():
@@ -315,9 +264,13 @@ def test_figures_of_the_first_readme() -> None:
         ("the paper's encoder", ("dense_mlp_alone", "aarl_dense_mlp", "forward_dense_mlp")),
         ("`simba`", ("sac_simba", "aarl_simba", "forward_simba")),
     ):
-        means = [f"{statistics.mean(last_returns(name, folder='simba_cheetah_run')):.0f}" for name in names]
+        means = [f"{statistics.mean(last_returns(name, folder='agent/parts')):.0f}" for name in names]
         assert " | ".join([row, *means]) in readme
-    iqm = interquartile_means(read_runs(RESULTS / "simba_cheetah_run")).set_index("variant").loc["forward_simba"]
+    iqm = (
+        interquartile_means(read_runs(RESULTS / "agent/tasks/runs").query("environment == 'dm_control/cheetah-run-v0'"))
+        .set_index("variant")
+        .loc["forward_simba"]
+    )
     assert f"interquartile mean is {iqm['iqm']:.0f}, 95 % interval {iqm['low']:.0f} to {iqm['high']:.0f}" in readme
     for text, task in (
         ("AARL-State gets {} on Cheetah-Run, SAC with the same encoder {}", "cheetah-run"),
@@ -325,7 +278,7 @@ def test_figures_of_the_first_readme() -> None:
     ):
         aarl, sac_dense = (shown(last_returns(f"{variant}_small", task)) for variant in ("aarl_state", "sac_dense_mlp"))
         assert text.format(aarl, sac_dense) in readme
-    aarl, paper = shown(last_returns("aarl_state_bf16", folder="choices")), SCORE.format(**papers("AARL-State"))
+    aarl, paper = shown(last_returns("aarl_state_bf16", folder="paper/full_size")), SCORE.format(**papers("AARL-State"))
     assert f"AARL-State gets {aarl} on Cheetah-Run, where the paper has {paper}." in readme
     for row, choice in (
         ("as SB3 starts, action repeat 4", ""),
@@ -334,12 +287,14 @@ def test_figures_of_the_first_readme() -> None:
         ("action repeat 2 alone", "_repeat_2"),
         ("all three", "_orthogonal_squashed_repeat_2"),
     ):
-        sizes = ((f"sac_identity_small{choice}", "choices_small"), (f"sac_identity{choice}_bf16", "choices"))
+        sizes = ((f"sac_identity_small{choice}", "paper/small"), (f"sac_identity{choice}_bf16", "paper/full_size"))
         cells = [with_seeds(last_returns(variant, task, folder)) for task in TASKS for variant, folder in sizes]
         assert " | ".join([f"| {row}", *cells]) + " |" in readme
     cheetah, walker = (f"{SCORE.format(**papers('SAC-Identity', task))} | " * 2 for task in TASKS)
     assert f"| the paper (10) | {cheetah}{walker}".strip() in readme
-    fp32, both, none = (last_returns(f"sac_identity{x}", folder="choices") for x in ("", "_orthogonal_squashed_bf16", "_bf16"))
+    fp32, both, none = (
+        last_returns(f"sac_identity{x}", folder="paper/full_size") for x in ("", "_orthogonal_squashed_bf16", "_bf16")
+    )
     assert min(fp32) > max(both) and min(both) > max(none)
     assert f"| and in float32 | - | {with_seeds(fp32)} | - | - |" in readme
 
@@ -348,7 +303,9 @@ def test_from_pixels() -> None:
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
 
     def curve(variant: str) -> dict[int, float]:
-        points = read_curve(RESULTS / "pixels" / f"{variant}_pixel_128_bf16" / "cheetah-run" / "seed-0" / "curve.csv")
+        points = read_curve(
+            RESULTS / "pixels/cheetah_run/runs" / f"{variant}_pixel_128_bf16" / "cheetah-run" / "seed-0" / "curve.csv"
+        )
         return {point.environment_steps: point.mean for point in points}
 
     aarl, curl, sac = (curve(variant) for variant in ("aarl", "curl", "sac"))
