@@ -19,7 +19,7 @@ DEMO := dmc,search
 demo: $(VENV)/.installed
 	$(BIN)/aarl search zoo_configs/search/demo.yml --workers 2
 	$(BIN)/aarl cross-validate zoo_configs/search/demo.yml --workers 2
-	$(BIN)/aarl train cheetah-run --hyperparams zoo_configs/demo.yml --aux-loss runs/demo/winner.yml --folder runs/demo/winner
+	$(BIN)/aarl train cheetah-run --steps 20000 --aux-loss runs/demo/winner.yml --folder runs/demo/winner
 	$(BIN)/aarl report runs/demo
 
 test: $(VENV)/.installed-dev system

@@ -29,7 +29,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_aarl.envs import PREFIX, env_ids, make_dmc_env  # first: it chooses the renderer
+from sb3_aarl.envs import env_ids, make_dmc_env  # first: it chooses the renderer
 from sb3_aarl.files import ConfigError, read_yaml
 from sb3_aarl.sac_aux import SACAux
 
@@ -72,7 +72,7 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     RL-Zoo passes those of the file to the training environment only; those of the command line are stored with the model
     and reach evaluations, ``enjoy`` and ``record_video`` too. Given ones win.
 
-    Without a file ``sac_aux`` has AARL-State's for tasks of DeepMind Control, and RL-Zoo's own for SAC elsewhere.
+    Without a file ``sac_aux`` has those of ``zoo_configs/sac_aux.yml``: SACAux's own.
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_aarl.rl_zoo train", add_help=False)
     parser.add_argument("--algo")
@@ -82,9 +82,7 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     known, _ = parser.parse_known_args(arguments)
     path = known.conf_file
     if path is None and known.algo == "sac_aux":
-        ours = files("sb3_aarl.zoo_configs") / "paper/aarl_state.yml"
-        theirs = files("rl_zoo3") / "hyperparams/sac.yml"
-        path = str(ours if str(known.env).startswith(PREFIX) else theirs)
+        path = str(files("sb3_aarl.zoo_configs") / "sac_aux.yml")
         arguments = [*arguments, "-conf", path]
     if path is None or not path.endswith((".yml", ".yaml")):
         return list(arguments)

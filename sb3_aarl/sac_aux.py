@@ -52,7 +52,7 @@ class SACAux(SAC):
     of the target critic is the momentum encoder of the auxiliary loss. Arguments of SB3's SAC have its defaults, but for
     ``ent_coef``: from the paper's 0.1 Cheetah-Run (action repeat 4) has 199 at 20,000 environment steps, from SAC's 1 it
     has 34 (ten and two seeds), and both end level. On MuJoCo's tasks of Gymnasium SAC's is the safer one, with
-    ``learning_starts=5000``: see ``zoo_configs/default.yml``. Arguments of SACAux alone have the paper's (tables 7 and 8)
+    ``learning_starts=5000``: see ``zoo_configs/sac_aux.yml``. Arguments of SACAux alone have the paper's (tables 7 and 8)
     unless another source is named; all of the paper's values are in ``zoo_configs/``. From states encoder and loss are
     those that learnt fastest (``results/README.md``), not the paper's.
 

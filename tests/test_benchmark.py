@@ -102,7 +102,7 @@ BETWEEN = r"multiples of 4 \(.*action repeat\), "
 @pytest.mark.parametrize(
     ("names", "options", "message"),
     [
-        ("mine.yml other/mine.yml", {}, "two files are called mine"),
+        ("mine.yml other/mine.yml", {}, "two variants are called mine"),
         ("mine.yml missing.yml", {}, "missing.yml: cannot be read: No such file"),
         ("mine.yml default.yml", {}, "no entry of one environment in common: name environments"),
         ("mine.yml", {"environments": ["Pendulm-v1"]}, "unknown environment 'Pendulm-v1'.*nearest: Pendulum-v1"),

@@ -101,7 +101,7 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
         (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "'q_t' is no token"),
         (["Pendulum-v1"], "how many steps"),
         (["Pendulum-v1", "--steps", "3", "--evaluations", "5"], "too few"),
-        (["Pendulum-v1", "--hyperparams", "simba/sac_simbaa"], "nearest: simba/sac_simba"),
+        (["Pendulum-v1", "--hyperparams", "sac_pixl"], "nearest: sac_pixel"),
         (["CartPole-v1", "--steps", "1000"], "CartPole-v1 cannot be trained"),
     ],
     ids=["environment", "module", "name", "notation", "no steps", "steps", "file", "actions"],

@@ -20,9 +20,8 @@ from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.results.statistics import interquartile_means
 from sb3_aarl.search.results.table import paper_scores, read_runs
 from sb3_aarl.search.studies import benchmark
-from sb3_aarl.search.studies.benchmark import load_benchmark
+from sb3_aarl.search.studies.benchmark import load_benchmark, read_experiment
 from sb3_aarl.search.studies.cross_validation import ranking
-from sb3_aarl.search.training.config import read_yaml
 from scipy.stats import mannwhitneyu
 from typer.testing import CliRunner
 
@@ -112,8 +111,8 @@ def test_a_search_found_what_its_text_says() -> None:
     assert first < second and max(later) < second + 5
     # What is confirmed is what the cross-validation ranks first, and the best evolved loss, its second.
     ranked = ranking(stored_scores(study_folder / "cross-validation"))["mean"]
-    files = [RESULTS.parent / f"zoo_configs/simba/{name}_simba.yml" for name in ("published", "evolved")]
-    assert [str(resolve(read_yaml(file)["default"]["aux_loss"])) for file in files] == list(ranked.index[:2])
+    variants = read_experiment(RESULTS / "search/confirmation/variants.yml").variants
+    assert [str(resolve(variants[f"{name}_simba"]["aux_loss"])) for name in ("published", "evolved")] == list(ranked.index[:2])
     text = "`{}`, is first with {:.0f}, the best evolved one second with {:.0f}, means of both tasks"
     assert text.format(ranked.index[0], *ranked[:2]) in readme
     losses = ("published", "evolved", "aarl", "forward", "sac")

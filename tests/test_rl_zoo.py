@@ -237,10 +237,7 @@ def test_no_arguments_of_the_environment(text: str, tmp_path: Path) -> None:
     assert with_env_kwargs(arguments) == arguments
 
 
-def test_a_file_is_not_needed() -> None:
-    pytest.importorskip("rl_zoo3", reason="pip install 'sb3-aarl[zoo]'")
+def test_without_a_file_it_has_the_defaults() -> None:
     arguments = with_env_kwargs(SAC_AUX)
-    assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "paper/aarl_state.yml"
-    assert added(arguments) == {"action_repeat": 4}
-    *_, theirs = with_env_kwargs(["--algo", "sac_aux", "--env", "Pendulum-v1"])
-    assert theirs.endswith("rl_zoo3/hyperparams/sac.yml")
+    assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "sac_aux.yml" and added(arguments) == {"action_repeat": 4}
+    assert Path(with_env_kwargs(["--algo", "sac_aux", "--env", "Pendulum-v1"])[-1]) == ZOO / "sac_aux.yml"

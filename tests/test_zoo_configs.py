@@ -11,7 +11,7 @@ import gymnasium as gym
 import pytest
 import torch as th
 import yaml
-from sb3_aarl.search.training.config import load_hyperparameters, merge
+from sb3_aarl.search.training.config import load_hyperparameters
 from stable_baselines3.common.logger import Logger
 
 from sb3_aarl import SACAux, catalog, encoders
@@ -66,6 +66,15 @@ ADAM = {"net_arch": [1024, 1024], "optimizer_kwargs": {"betas": [0.9, 0.999]}}
 PUBLIC_START = {"ortho_init": True, "squash_log_std": [-10, 2]}
 
 
+SB3_SAC = {"aux_loss": None, "ent_coef": "auto", "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}}
+MUJOCO = {"learning_starts": 5000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4}
+
+
+def action_repeat(task: str) -> int:
+    """The public code's; table 8 has 4 for all tasks."""
+    return {"cartpole": 8, "walker": 2, "finger": 2}.get(task.partition("-")[0], 4)
+
+
 def with_loss(aux_loss: str | None, auxiliary: dict[str, Any]) -> dict[str, Any]:
     """The loss, and the keys that only runs with a loss have."""
     if aux_loss == "auto":
@@ -75,7 +84,7 @@ def with_loss(aux_loss: str | None, auxiliary: dict[str, Any]) -> dict[str, Any]
 
 def table_8(variant: str, task: str) -> dict[str, Any]:
     encoder, n_layers, aux_loss = STATE_VARIANTS[variant]
-    repeat = {"cartpole": 8, "walker": 2, "finger": 2}.get(task.partition("-")[0], 4)  # the public code's; 4 in table 8
+    repeat = action_repeat(task)
     kwargs = {"features_extractor_kwargs": {"features_dim": 40, "n_layers": n_layers, "width": 40}}  # width: not in the paper
     return {
         **COMMON,
@@ -92,7 +101,7 @@ def table_8(variant: str, task: str) -> dict[str, Any]:
 
 def table_7(variant: str, task: str) -> dict[str, Any]:
     aux_loss, crop, column = PIXEL_VARIANTS[variant]
-    repeat = {"cartpole-swingup": 8, "walker-walk": 2, "finger-spin": 2}.get(task, 4)
+    repeat = action_repeat(task)
     final = {
         "encoder_learning_rate": 3e-3 if task in ("cheetah-run", "finger-spin", "walker-walk") else 1e-3,
         "aux_batch_size": {"walker-walk": 128, "cheetah-run": 256, "finger-spin": 256}.get(task, 512),
@@ -149,128 +158,18 @@ def test_rl_zoo_reads_the_same(path: Path) -> None:
         assert entry == json.loads(json.dumps(load_hyperparameters(path, env_id))), env_id  # lists for tuples
 
 
-# Batch and hidden layers of SB3's SAC.
-SMALL: dict[str, Any] = {"batch_size": 256, "policy_kwargs": {"net_arch": [256, 256]}}
-# Choices from states but those of the action repeat have table 8's.
-REPEAT_2, REPEAT_4 = ({"n_timesteps": 100_000 // n, "env_kwargs": {"action_repeat": n}} for n in (2, 4))
-PUBLIC: dict[str, Any] = {"policy_kwargs": PUBLIC_START}
-# What each file of choices/ changes, and of which variant.
-CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
-    "aarl_state_bf16": ("aarl_state", {"precision": "bf16"}),
-    "curl_state_bf16": ("curl_state", {"precision": "bf16"}),
-    "sac_dense_mlp_bf16": ("sac_dense_mlp", {"precision": "bf16"}),
-    "sac_identity_bf16": ("sac_identity", {"precision": "bf16"}),
-    "published_state": ("aarl_state", {"aux_loss": "cheetah-run-state-7-3"}),
-    "aarl_state_small": ("aarl_state", SMALL),
-    "aarl_state_small_bf16": ("aarl_state", {**SMALL, "precision": "bf16"}),
-    "aarl_state_small_joint": ("aarl_state", {**SMALL, "joint_optimizer": True}),
-    "aarl_state_small_orthogonal": ("aarl_state", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
-    "aarl_state_small_predictor": ("aarl_state", {**SMALL, "predictor_width": None, "predictor_batch_norm": True}),
-    "aarl_state_small_separate": ("aarl_state", merge(SMALL, {"policy_kwargs": {"share_features_extractor": False}})),
-    "curl_state_small": ("curl_state", SMALL),
-    "sac_dense_mlp_small": ("sac_dense_mlp", SMALL),
-    "sac_dense_mlp_small_orthogonal": ("sac_dense_mlp", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
-    "sac_identity_small": ("sac_identity", SMALL),
-    "sac_identity_small_orthogonal": ("sac_identity", merge(SMALL, {"policy_kwargs": {"ortho_init": True}})),
-    "sac_identity_small_orthogonal_squashed": ("sac_identity", merge(SMALL, PUBLIC)),
-}
-for name in ("aarl_state", "sac_dense_mlp", "sac_identity"):
-    CHOICES[f"{name}_small_repeat_2"] = (name, {**SMALL, **REPEAT_2})
-    CHOICES[f"{name}_small_orthogonal_squashed_repeat_2"] = (name, {**merge(SMALL, PUBLIC), **REPEAT_2})
-CHOICES["sac_identity_orthogonal_squashed_bf16"] = ("sac_identity", {**PUBLIC, "precision": "bf16"})
-CHOICES["sac_identity_orthogonal_squashed_repeat_2_bf16"] = ("sac_identity", {**PUBLIC, **REPEAT_2, "precision": "bf16"})
-EVOLUTION: dict[str, Any] = {"batch_size": 128, "learning_rate": 1e-3, "n_timesteps": 25_000, "precision": "bf16"}
-EVOLUTION["env_kwargs"] = {"fast_rendering": True}
-CHOICES["sac_pixel_128_bf16"] = ("sac_pixel", EVOLUTION)
-for name in ("aarl_pixel", "curl_pixel"):
-    CHOICES[f"{name}_128_bf16"] = (name, {**EVOLUTION, "encoder_learning_rate": 1e-3, "aux_batch_size": 128})
-
-
-def test_choices_differ_in_nothing_else() -> None:
-    assert {path.stem for path in (ZOO / "choices").glob("*.yml")} == CHOICES.keys()
-    for choice, (variant, changes) in CHOICES.items():
-        path = ZOO / "choices" / f"{choice}.yml"
-        for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
-            repeat = REPEAT_4 if variant in STATE_VARIANTS else {}
-            values = merge(load_hyperparameters(ZOO / "paper" / f"{variant}.yml", env_id), repeat)
-            for name in PUBLIC_START:  # sac_identity has it, its choices are from before
-                values["policy_kwargs"].pop(name, None)
-            assert load_hyperparameters(path, env_id) == merge(values, changes)
-
-
-def simba(width: int) -> dict[str, Any]:
-    extractor = {"features_extractor_class": "simba", "features_extractor_kwargs": {"features_dim": width}}
-    return {"precision": "bf16", "policy_kwargs": extractor}
-
-
-def with_policy(values: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
-    return merge(values, {"policy_kwargs": kwargs})
-
-
-ENTROPY = {"ent_coef": "auto_0.1"}
-DENSE_MLP = {"precision": "bf16", "policy_kwargs": {"features_extractor_class": "dense_mlp"}}
-PAPERS, FINALIST = DENSE_MLP | ENTROPY, simba(64) | ENTROPY
-PAPERS_FP32, FINALIST_FP32 = ({"policy_kwargs": body["policy_kwargs"]} | ENTROPY for body in (PAPERS, FINALIST))
-BLOCKS: dict[str, Any] = {"net_arch": [128], "network": "simba"}
-EVOLVED = (
-    "{s_t, a_t, a_t+1, a_t+2, r_t+2, a_t+3, r_t+3, r_t+4, s_t+5, a_t+5, a_t+6, a_t+7, a_t+8, r_t+8} "
-    "-> {s_t+1, s_t+2, a_t+2, s_t+3, a_t+3, a_t+4, s_t+6, s_t+8, s_t+9}"
-)
-# How files differ from SACAux's defaults: bodies that were compared, the finalist, its parts, and what it is compared with.
-BODIES: dict[str, dict[str, Any]] = {
-    "body/default_dense_mlp_bf16": DENSE_MLP,
-    "body/default_simba_bf16": simba(128),
-    "body/default_simba_entropy_bf16": simba(128) | ENTROPY,
-    "body/default_simba_64_bf16": simba(64),
-    "body/default_simba_64_entropy_bf16": FINALIST,
-    "body/default_simba_64_entropy_no_aux_bf16": FINALIST | {"aux_loss": None},
-    "body/default_simba_32_entropy_bf16": simba(32) | ENTROPY,
-    "simba/aarl_simba": FINALIST,
-    "simba/forward_simba_repeat_4": FINALIST | {"aux_loss": "forward-dynamics"},
-    "forward_simba": simba(64)
-    | {"aux_loss": "forward-dynamics", "learning_starts": 5000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4},
-    "simba/published_simba": FINALIST | {"aux_loss": "cheetah-run-state-7-3"},
-    "simba/aarl_simba_fp32": FINALIST_FP32,
-    "simba/published_simba_fp32": FINALIST_FP32 | {"aux_loss": "cheetah-run-state-7-3"},
-    "simba/evolved_simba": FINALIST | {"aux_loss": EVOLVED},
-    "simba/evolved_simba_fp32": FINALIST_FP32 | {"aux_loss": EVOLVED},
-    "simba/sac_simba": FINALIST | {"aux_loss": None},
-    "simba/sac_simba_fp32": FINALIST_FP32 | {"aux_loss": None},
-    "simba/sac_states": {"aux_loss": None, "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}},
-    "simba/aarl_dense_mlp": PAPERS,
-    "simba/aarl_dense_mlp_fp32": PAPERS_FP32,
-    "simba/published_dense_mlp_fp32": PAPERS_FP32 | {"aux_loss": "cheetah-run-state-7-3"},
-    "simba/forward_dense_mlp": PAPERS | {"aux_loss": "forward-dynamics"},
-    "simba/dense_mlp_alone": PAPERS | {"aux_loss": None},
-    "simba/aarl_simba_heads": with_policy(FINALIST, **BLOCKS),
-    "simba/aarl_dense_mlp_heads": with_policy(PAPERS, **BLOCKS),
-    "simba/aarl_simba_critic_norm": with_policy(FINALIST, network={"pi": "mlp", "qf": "layer_norm"}),
-    "simba/aarl_simba_unnormalized": with_policy(FINALIST, features_extractor_kwargs={"normalize": False}),
-    "simba/aarl_dense_mlp_normalized": PAPERS | {"normalize": {"norm_reward": False}},
-    "simba/aarl_simba_two_steps": FINALIST | {"gradient_steps": 2},
-    "simba/aarl_simba_one_critic": with_policy(FINALIST, n_critics=1),
-    "simba/aarl_simba_weight_decay": with_policy(
-        FINALIST, optimizer_kwargs={"weight_decay": 0.01, "decoupled_weight_decay": True}
-    ),
-}
-
-
-def test_bodies_differ_from_the_defaults_in_nothing_else() -> None:
-    # They ran when SAC's coefficient and AARL-State were the defaults.
-    changed = {"ent_coef": "auto", "ent_coef_learning_rate": 3e-4, "aux_loss": "aarl-state"}
-    defaults = load_hyperparameters(ZOO / "default.yml", "MyEnv-v0") | changed
-    folders = [path.relative_to(ZOO).with_suffix("").as_posix() for path in ZOO.glob("*/*.yml")]
-    assert {name for name in folders if name.startswith(("body/", "simba/"))} | {"forward_simba"} == BODIES.keys()
-    for name, changes in BODIES.items():
-        path = ZOO / f"{name}.yml"
-        for env_id in yaml.safe_load(path.read_text()).keys() - {"default"}:
-            often = env_id.startswith(("dm_control/walker", "dm_control/finger")) and not name.endswith("repeat_4")
-            repeat = 2 if often else 4
-            steps = {"n_timesteps": 100_000 // repeat, "env_kwargs": {"action_repeat": repeat}}
-            if name == "forward_simba":
-                steps |= {"learning_starts": 100, "ent_coef": "auto_0.1", "ent_coef_learning_rate": 3e-4}
-            assert load_hyperparameters(path, env_id) == {**defaults, **changes, **steps}
-        assert load_hyperparameters(path, "MyEnv-v0") == {**defaults, **changes}
+@pytest.mark.parametrize(("name", "own"), [("sac_aux", {}), ("sac", SB3_SAC)])
+def test_the_defaults_are_those_of_the_class(name: str, own: dict[str, Any]) -> None:
+    """Only Gymnasium's MuJoCo tasks have exceptions; DeepMind Control's have the action repeats of the public code."""
+    path, own = ZOO / f"{name}.yml", {"policy": "MlpPolicy", "n_timesteps": 100_000, **own}
+    assert load_hyperparameters(path, "MyEnv-v0") == own
+    exceptions = MUJOCO if name == "sac_aux" else {"learning_starts": 5000}
+    for env_id in ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5"):
+        assert load_hyperparameters(path, env_id) == own | exceptions
+    for env_id in env_ids():
+        repeat = action_repeat(env_id.removeprefix("dm_control/"))
+        steps = {"n_timesteps": 100_000 // repeat, "env_kwargs": {"action_repeat": repeat}}
+        assert load_hyperparameters(path, env_id) == own | steps
 
 
 @functools.cache

@@ -150,9 +150,10 @@ def benchmark(
         list[Path],
         typer.Argument(
             callback=lambda paths: [find_file(path) for path in paths],
-            help=f"Hyper-parameters, one for each variant: {options.SHIPPED}, such as aarl_state.",
+            help=f"Hyper-parameters, one for each variant: {options.SHIPPED}, such as aarl_state; or a variants.yml.",
         ),
     ],
+    variants: Annotated[str | None, typer.Option(help="Names of variants, such as aarl_state. Default: all.")] = None,
     envs: Annotated[
         str | None, typer.Option(help="Such as cheetah-run,Pendulum-v1. Default: those that all files have an entry for.")
     ] = None,
@@ -173,22 +174,30 @@ def benchmark(
     workers: Workers = 1,
     threads: Annotated[int, typer.Option(help="Threads of each run.", min=1)] = 1,
     folder: Annotated[
-        Path, typer.Option(help="Folder of the benchmark; more variants, tasks and seeds may be added to it.")
-    ] = options.BENCHMARK,
+        Path | None,
+        typer.Option(
+            help="Folder of the benchmark; more variants, tasks and seeds may be added to it. Default: runs/ beside a "
+            f"variants.yml, else {options.BENCHMARK}."
+        ),
+    ] = None,
     imports: options.Imports = "",
     dry_run: options.DryRun = False,
     json: Json = False,
 ) -> None:
     """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command resumes it."""
     from sb3_aarl.search.cli.results import table
-    from sb3_aarl.search.studies.benchmark import load_benchmark, parse_seeds, parse_steps
+    from sb3_aarl.search.studies.benchmark import RUNS, VARIANTS, load_benchmark, parse_seeds, parse_steps
 
-    names = [name.strip() for name in envs.split(",")] if envs else []
+    names, wanted = ([name.strip() for name in text.split(",")] if text else [] for text in (envs, variants))
+    is_experiment = configs[0].name == VARIANTS
+    folder = folder or (configs[0].parent / RUNS if is_experiment else options.BENCHMARK)
     steps = parse_steps(checkpoints) if checkpoints else ()
     between = parse_steps(every) if every else (None,)
     if len(between) != 1:
         raise ValueError(f"--every is one number of environment steps, not {every}")
-    matrix = load_benchmark(configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder, modules(imports))
+    matrix = load_benchmark(
+        configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder, modules(imports), wanted
+    )
     if dry_run:
         show_costs(unfinished(matrix), workers)
         return

@@ -28,7 +28,7 @@ def train(
     ] = None,
     hyperparams: Annotated[
         Path | None,
-        typer.Option(help=f"Hyper-parameters: {SHIPPED}. Default: aarl_state for DeepMind Control, default for others."),
+        typer.Option(help=f"Hyper-parameters: {SHIPPED}. Default: sac_aux, SACAux's own."),
     ] = None,
     steps: Annotated[
         int | None, typer.Option(help="Environment steps (agent steps x action repeat). Default: the file's n_timesteps.")
@@ -96,16 +96,14 @@ def losses(
 
 
 @app.command(rich_help_panel="One agent")
-def configs(
-    every: Annotated[bool, typer.Option("--all", help="Those of the experiments in results/ too.")] = False, json: Json = False
-) -> None:
+def configs(json: Json = False) -> None:
     """List the configurations that come with the package, for commands that take a file."""
     from sb3_aarl.search.training.shipped import shipped_files
 
     kinds = {"Hyper-parameters: aarl train --hyperparams NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
     found = {
-        title: {name: first_sentence(path) for name, path in files.items() if every or "/" not in name}
-        for title, files in ((title, shipped_files(searches)) for title, searches in kinds.items())
+        title: {name: first_sentence(path) for name, path in shipped_files(searches).items()}
+        for title, searches in kinds.items()
     }
     if json:
         say_json({title.partition(":")[0].lower(): names for title, names in found.items()})

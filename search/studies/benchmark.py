@@ -2,26 +2,30 @@
 
 import json
 import re
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
+from pydantic import BaseModel
 from sb3_aarl.search.execution.matrix import Cell, Matrix, task_name
 from sb3_aarl.search.training.config import (
     ConfigError,
     action_repeat,
     check_checkpoints,
+    check_hyperparameters,
+    entry_of,
     import_modules,
-    load_hyperparameters,
+    merge,
     read_yaml,
     resolve_env_id,
+    validated,
 )
 from sb3_aarl.search.training.folder import FREE, Run, differences, partial_curve
 from sb3_aarl.search.training.provenance import ABOUT, read_about
 from sb3_aarl.search.training.setup import check_run
+from sb3_aarl.search.training.shipped import find_file
 
 from sb3_aarl import catalog
 from sb3_aarl.envs import PREFIX
@@ -29,6 +33,53 @@ from sb3_aarl.envs import PREFIX
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
 UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
+# The file of an experiment, and the folder of its runs beside it.
+VARIANTS, RUNS = "variants.yml", "runs"
+
+
+class Experiment(BaseModel, extra="forbid"):
+    """
+    A ``variants.yml``: hyper-parameters with names.
+
+    :param base: Hyper-parameters by environment, as in RL-Zoo's files, or such a file: its path, relative to this one, or the
+        name of a shipped one
+    :param variants: For each name the hyper-parameters that differ from the base; they are merged over it
+    :param runs: Folders of other experiments, relative to this file, whose runs belong into the table too
+    """
+
+    base: str | dict[str, Any]
+    variants: dict[str, dict[str, Any]]
+    runs: tuple[str, ...] = ()
+
+
+class Variant(NamedTuple):
+    """Hyper-parameters with a name: those of a file, or a base and what differs from it."""
+
+    name: str
+    file: Path
+    entries: Mapping[str, Any]
+    changes: Mapping[str, Any]
+
+    def hyperparameters(self, env_id: str) -> dict[str, Any]:
+        """The hyper-parameters for an environment."""
+        entry = entry_of(self.entries, env_id, str(self.file))
+        return check_hyperparameters(merge(entry, self.changes), env_id, f"{self.file}: {self.name}")
+
+
+def read_experiment(path: Path) -> Experiment:
+    """Read a ``variants.yml``."""
+    return validated(Experiment, read_yaml(path), str(path))
+
+
+def read_variants(path: Path) -> list[Variant]:
+    """The variants in a file: those of a ``variants.yml``, or one with the name of a file of hyper-parameters."""
+    entries = read_yaml(path)
+    if "variants" not in entries:
+        return [Variant(path.stem, path, entries, {})]
+    experiment = read_experiment(path)
+    base = experiment.base
+    entries = read_yaml(find_file(Path(base), folder=path.parent)) if isinstance(base, str) else base
+    return [Variant(name, path, entries, changes) for name, changes in experiment.variants.items()]
 
 
 def load_benchmark(
@@ -41,38 +92,45 @@ def load_benchmark(
     threads: int = 1,
     folder: Path = Path("runs/benchmark"),
     imports: Sequence[str] = (),
+    names: Sequence[str] = (),
 ) -> Matrix:
     """
-    Read the variants of a benchmark, and check all that can be checked without training. Default environments are those that
-    all files name, default checkpoints those of 100k, 500k and 1000k that lie in every file's ``n_timesteps``.
+    Read the variants of a benchmark, and check all that can be checked without training.
+
+    :param files: Files of hyper-parameters, each a variant with the name of its file, and files such as ``variants.yml``
+    :param environments: Environments. Default: those that all files name
+    :param checkpoints: Environment steps to compare at. Default: those of 100k, 500k and 1000k that are in every
+        variant's ``n_timesteps``
+    :param names: The variants to train. Default: all in the files
     """
-    for stem, count in Counter(path.stem for path in files).items():
-        if count > 1:
-            raise ConfigError(f"two files are called {stem}: a variant has the name of its file")
+    variants = [variant for file in files for variant in read_variants(file) if variant.name in names or not names]
+    found = [variant.name for variant in variants]
+    for name in (*names, *found):
+        if found.count(name) != 1:
+            raise ConfigError(f"{'two variants are' if name in found else 'no variant is'} called {name}")
     import_modules(imports)
-    names = environments or _common_environments(files)
-    ids = list(dict.fromkeys(resolve_env_id(name) for name in names))
-    # SACAux's default, written out: a file that names no loss is not one that says "none".
+    ids = list(dict.fromkeys(map(resolve_env_id, environments or _common_environments(variants))))
+    # SACAux's default, written out: a variant that names no loss is not one that says "none".
     hyperparameters = {
-        (path.stem, name): {"aux_loss": "auto", **load_hyperparameters(path, name)} for path in files for name in ids
+        (variant.name, env_id): {"aux_loss": "auto", **variant.hyperparameters(env_id)}
+        for variant, env_id in product(variants, ids)
     }
-    compared = {name: tuple(sorted(set(checkpoints))) or _default_checkpoints(name, hyperparameters) for name in ids}
-    paths = {path.stem: str(path) for path in files}
+    compared = {env_id: tuple(sorted(set(checkpoints))) or _default_checkpoints(env_id, hyperparameters) for env_id in ids}
     runs: dict[Cell, Run] = {}
     abouts: dict[Cell, dict[str, Any]] = {}
     # Seed by seed, so that a first run of each is there early.
-    for seed, environment, variant in product(seeds, ids, paths):
-        cell = Cell(variant, environment, seed)
-        settings, steps = hyperparameters[cell[:2]], compared[cell.environment]
+    for seed, environment, variant in product(seeds, ids, variants):
+        cell = Cell(variant.name, environment, seed)
+        settings, steps = hyperparameters[cell[:2]], compared[environment]
         between = () if every is None else range(every, steps[-1], every)
         evaluations = tuple(sorted({*steps, *between}))
-        check_checkpoints(evaluations, settings, f"{cell.variant} on {environment}")
+        check_checkpoints(evaluations, settings, f"{variant.name} on {environment}")
         loss = settings["aux_loss"]
         runs[cell] = Run(
-            environment=cell.environment,
+            environment=environment,
             aux_loss=loss if loss in (None, "auto") else str(catalog.resolve(loss)),
             hyperparameters={key: value for key, value in settings.items() if key != "aux_loss"},
-            seed=cell.seed,
+            seed=seed,
             checkpoints=evaluations,
             evaluation_episodes=evaluation_episodes,
             threads=threads,
@@ -84,7 +142,7 @@ def load_benchmark(
             "checkpoints": list(steps),
             "evaluations": list(evaluations),
             "evaluation_episodes": evaluation_episodes,
-            "file": paths[cell.variant],
+            "file": str(variant.file),
             "hyperparameters": json.loads(json.dumps(settings)),  # as it is read again
         }
     matrix = Matrix("benchmark", folder, runs, abouts)
@@ -94,11 +152,17 @@ def load_benchmark(
 
 
 def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
-    """The ``provenance.json`` of a benchmark's runs, by their folders, if each run is there once and all can be compared."""
+    """
+    The ``provenance.json`` of a benchmark's runs, by their folders, if each run is there once and all can be compared.
+
+    :param folder: Folder of a benchmark, or of an experiment, which has a ``variants.yml``
+    """
     abouts: dict[Path, dict[str, Any]] = {}
     folders: dict[Cell, Path] = {}
     trained: dict[tuple[str, str], Path] = {}
-    for path in sorted(file.parent for file in folder.glob(f"*/*/*/{ABOUT}")):
+    experiment = folder / VARIANTS
+    parts = (RUNS, *read_experiment(experiment).runs) if experiment.exists() else ("",)
+    for path in sorted(file.parent for part in parts for file in (folder / part).rglob(ABOUT)):
         about = {"sessions": [], **read_about(path)}
         if not {*Cell._fields, "checkpoints"} <= about.keys():
             raise ValueError(f"{path / ABOUT} is not that of a benchmark's run")
@@ -150,10 +214,10 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(seeds)
 
 
-def _common_environments(files: Iterable[Path]) -> list[str]:
-    """The environments that all files name, in the order of the first."""
-    first, *others = map(read_yaml, files)
-    common = [name for name in first if name != "default" and all(name in names for names in others)]
+def _common_environments(variants: Sequence[Variant]) -> list[str]:
+    """The environments that all variants name, in the order of the first."""
+    first, *others = (variant.entries for variant in variants)
+    common = [name for name in first if name != "default" and all(name in entries for entries in others)]
     if not common:
         raise ConfigError("the files have no entry of one environment in common: name environments")
     return common

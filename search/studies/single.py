@@ -40,7 +40,7 @@ def prepare_one(
     """
     import_modules(imports)
     environment = resolve_env_id(environment)
-    file = find_file(Path(hyperparams or ("aarl_state" if environment.startswith(PREFIX) else "default")))
+    file = find_file(Path(hyperparams or "sac_aux"))
     hyperparameters = load_hyperparameters(file, environment)
     if hyperparams is None:
         hyperparameters.pop("policy", None)  # the one that fits the observations

@@ -9,7 +9,7 @@ SEARCHES = ZOO / "search"
 
 
 def shipped_files(searches: bool) -> dict[str, Path]:
-    """The shipped files by name, such as ``simba/sac_simba``: configurations of searches, or hyper-parameters."""
+    """The shipped files by name, such as ``paper/aarl_state``: configurations of searches, or hyper-parameters."""
     folder = SEARCHES if searches else ZOO
     files = [path for path in sorted(folder.rglob("*.yml")) if searches or SEARCHES not in path.parents]
     return {path.relative_to(folder).with_suffix("").as_posix(): path for path in files}
