@@ -172,7 +172,11 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(name: str, monke
         ("Pendulum-v1", "--executor ray --slurm mem_gb=4", "--slurm has no meaning with --executor ray"),
         ("CartPole-v1", "", "CartPole-v1 cannot be trained"),
         ("Pendulum-v1\nstages: 3", "", "small.yml: stages"),
-        ("Pendulum-v1\noverrides: {train_freq: 0}", "", "small.yml: Pendulum-v1 cannot be trained"),
+        (
+            "Pendulum-v1\noverrides: {train_freq: 0}",
+            "",
+            "small.yml: Pendulum-v1: train_freq must be a positive number of steps",
+        ),
         ("Pendulum-v1\noverrides: {train_freq: [1, episode], n_envs: 2}", "", "small.yml: Pendulum-v1 cannot be trained"),
         ("Pendulum-v1\noverrides: {stats_window_size: -1}", "--dry-run", "small.yml: Pendulum-v1 cannot be trained"),
         ("Pendulum-v1\noverrides: {policy_kwargs: {n_critics: 0}}", "", "small.yml: Pendulum-v1 cannot be trained"),

@@ -100,6 +100,10 @@ def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
 
 def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, Any], source: str) -> None:
     """Every checkpoint has to be the end of a rollout."""
+    train_freq = hyperparameters.get("train_freq", 1)
+    number, unit = (train_freq, "step") if isinstance(train_freq, int) else train_freq
+    if number < 1 or (unit == "episode" and number > 1):
+        raise ConfigError(f"{source}: train_freq must be a positive number of steps or 1 episode, not {train_freq}")
     interval = checkpoint_interval(hyperparameters)
     if between := [steps for steps in sorted(checkpoints) if steps % interval]:
         of_what = f"{interval} (train_freq x n_envs x action repeat)"

@@ -73,9 +73,6 @@ class Setup:
         settings = check_hyperparameters(run.hyperparameters, run.environment, source)
         self.action_repeat = action_repeat(settings)
         check_checkpoints(run.checkpoints, settings, source)
-        train_freq = settings.get("train_freq")
-        if isinstance(train_freq, tuple) and train_freq[1] == "episode" and train_freq[0] > 1:
-            raise ConfigError(f"{source}: train_freq must be at most 1 episode: a rollout has to end at each checkpoint")
         settings.pop("n_timesteps", None)
         self.env_kwargs: dict[str, Any] = settings.pop("env_kwargs", None) or {}
         self.env_wrapper = settings.pop("env_wrapper", None)
