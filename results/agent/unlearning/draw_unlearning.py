@@ -1,4 +1,4 @@
-"""Draw picture.png, and print the last row of each run, out of looks.jsonl: python results/agent/unlearning/draw_unlearning.py"""
+"""Draw picture.png, and print the last row of each run, out of looks.jsonl."""
 
 import json
 from collections import defaultdict
