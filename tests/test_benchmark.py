@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 from sb3_aarl.search.execution.executors import LocalExecutor
-from sb3_aarl.search.execution.matrix import Cell, cell_folder, comparable, run_matrix, scores
+from sb3_aarl.search.execution.matrix import Cell, cell_folder, check_matrix, comparable, run_matrix, scores
 from sb3_aarl.search.results import table
-from sb3_aarl.search.studies import benchmark
 from sb3_aarl.search.studies.benchmark import load_benchmark, parse_seeds, parse_steps, read_abouts, read_curves
 from sb3_aarl.search.studies.status import matrix_status
 from sb3_aarl.search.training import provenance
@@ -70,10 +69,7 @@ def test_other_text_is_refused(parse: Any, text: str) -> None:
         (6, ["aarl_state", "aarl_mlp_1", "aarl_mlp_4", "aarl_dense_mlp_4"], 12),
     ],
 )
-def test_without_options_the_zoo_makes_the_papers_tables(
-    number: int, variants: list[str], n_tasks: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(benchmark, "check_run", lambda run, source: None)
+def test_without_options_the_zoo_makes_the_papers_tables(number: int, variants: list[str], n_tasks: int) -> None:
     matrix = load_benchmark([ZOO / "paper" / f"{variant}.yml" for variant in variants])
     assert list(dict.fromkeys(cell.variant for cell in matrix.runs)) == variants
     assert {cell.seed for cell in matrix.runs} == {*range(10)} and len(matrix.runs) == n_tasks * 10 * len(variants)
@@ -117,7 +113,7 @@ def test_what_cannot_be_trained_is_refused(names: str, options: dict[str, Any], 
     (folder / "other" / "mine.yml").write_text(OWN)
     (folder / "default.yml").write_text("default: {env_kwargs: {action_repeat: 4}}\n")
     with pytest.raises(ValueError, match=message):
-        load(names, **options)
+        check_matrix(load(names, **options))
     assert not Path("out").exists()
 
 
@@ -197,10 +193,7 @@ def test_the_time_to_go_is_that_of_the_steps_that_are_left(folder: Path, monkeyp
 
 
 @pytest.mark.slow
-def test_runs_are_those_without_a_benchmark_and_what_fails_does_not_hide_the_others(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(benchmark, "check_run", lambda *_: None)  # it would refuse the one that fails
+def test_runs_are_those_without_a_benchmark_and_what_fails_does_not_hide_the_others(folder: Path) -> None:
     (folder / "bursts.yml").write_text(OWN.replace("learning_starts: 40", "learning_starts: 5\n  learning_rate: 1.0e+30"))
     matrix = load("mine.yml bursts.yml", seeds=[3], checkpoints=[80], every=40, evaluation_episodes=1)
     with LocalExecutor(2) as executor:

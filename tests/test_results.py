@@ -38,9 +38,8 @@ SCORE = "{mean:.0f} ± {std:.0f}"
 
 @pytest.fixture(autouse=True)
 def in_repository(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Commands name files of the repository; that their models can be made is not tested here."""
+    """Commands name files of the repository."""
     monkeypatch.chdir(RESULTS.parent)
-    monkeypatch.setattr(benchmark, "check_run", lambda run, source: None)
 
 
 def abouts_of(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, Any]]:

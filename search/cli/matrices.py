@@ -19,13 +19,12 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-def train_matrix(matrix: "Matrix", workers: int, retries: int = 3, config: Path | None = None) -> None:
-    """Train the runs of a matrix that are not finished, which are tried out if they are of a search, and show the progress."""
+def train_matrix(matrix: "Matrix", workers: int, retries: int = 3, config: Path | str = "") -> None:
+    """Train the runs of a matrix that are not finished, once it is known that they can be, and show the progress."""
     from sb3_aarl.search.execution.executors import LocalExecutor
     from sb3_aarl.search.execution.matrix import check_matrix, run_matrix
 
-    if config is not None:
-        check_matrix(matrix, str(config))
+    check_matrix(matrix, str(config))
     with LocalExecutor(workers) as executor, live() as show:
         for progress in run_matrix(matrix, executor, workers, retries):
             counts = f"{progress.finished}/{progress.total} runs, {progress.failed} failed"

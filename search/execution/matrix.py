@@ -67,19 +67,22 @@ def cell_folder(folder: Path, cell: Cell) -> Path:
     return folder / variant / task_name(cell.environment).replace("/", "_") / f"seed-{cell.seed}"
 
 
-def check_matrix(matrix: Matrix, source: str) -> None:
+def check_matrix(matrix: Matrix, source: str = "") -> None:
     """
-    Try out one of the runs that have the same hyper-parameters and environment, unless it is finished.
+    Make environment and model of one of the runs that have the same hyper-parameters, unless it is finished: on each
+    environment that may be of the user's own, and on one task of DeepMind Control.
 
-    :raises ConfigError: naming the source of the settings, when one of them cannot be trained
+    :param source: Where the hyper-parameters are from, for runs whose ``abouts`` name no ``file``
+    :raises ConfigError: naming the file, when a run cannot be trained
     """
-    kinds = {
-        (run.environment, json.dumps(run.hyperparameters)): run
-        for cell, run in matrix.runs.items()
-        if not is_finished(cell_folder(matrix.folder, cell))
-    }
-    for run in kinds.values():
-        check_run(run, source)
+    checked = set()
+    for cell, run in matrix.runs.items():
+        environment = PREFIX if run.environment.startswith(PREFIX) else run.environment
+        settings = {**run.hyperparameters, "n_timesteps": None}
+        kind = environment, run.aux_loss is None, json.dumps(settings)
+        if kind not in checked and not is_finished(cell_folder(matrix.folder, cell)):
+            check_run(run, matrix.abouts.get(cell, {}).get("file", source))
+            checked.add(kind)
 
 
 def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: int = 3) -> Iterator[MatrixProgress]:

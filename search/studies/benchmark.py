@@ -24,11 +24,9 @@ from sb3_aarl.search.training.config import (
 )
 from sb3_aarl.search.training.folder import FREE, Run, differences, partial_curve
 from sb3_aarl.search.training.provenance import ABOUT, read_about
-from sb3_aarl.search.training.setup import check_run
 from sb3_aarl.search.training.shipped import find_file
 
 from sb3_aarl import catalog
-from sb3_aarl.envs import PREFIX
 
 # Environment steps at which the paper compares (tables 3, 4 and 6).
 CHECKPOINTS = (100_000, 500_000, 1_000_000)
@@ -95,7 +93,7 @@ def load_benchmark(
     names: Sequence[str] = (),
 ) -> Matrix:
     """
-    Read the variants of a benchmark, and check all that can be checked without training.
+    Read the variants of a benchmark. That they can be trained is checked by ``check_matrix``.
 
     :param files: Files of hyper-parameters, each a variant with the name of its file, and files such as ``variants.yml``
     :param environments: Environments. Default: those that all files name
@@ -147,7 +145,6 @@ def load_benchmark(
         }
     matrix = Matrix("benchmark", folder, runs, abouts)
     _check_folder(matrix)
-    _check_models(matrix)
     return matrix
 
 
@@ -249,13 +246,3 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any], *keys: str) ->
     keys = (*keys, "evaluation_episodes", "program")
     old, new = ({key: about.get(key) for key in keys} | about.get("hyperparameters", {}) for about in (one, other))
     return next((found for found in differences(old, new) if found[0] not in FREE), None)
-
-
-def _check_models(matrix: Matrix) -> None:
-    """Make environment and model of each variant once, and on every environment that may be of the user's own."""
-    checked = set()
-    for cell, run in matrix.runs.items():
-        what = cell.variant if cell.environment.startswith(PREFIX) else cell[:2]
-        if what not in checked:
-            checked.add(what)
-            check_run(run, matrix.abouts[cell]["file"])
