@@ -41,9 +41,6 @@ cross_validation:
   environments: [Pendulum-v1, MountainCarContinuous-v0]
   seeds: [2, 3]
   top: 3
-operator_selection:
-  environments: [Pendulum-v1]
-  seeds: [0]
 baselines:
 - {name: SAC}
 - {name: CURL, aux_loss: curl}
@@ -327,7 +324,7 @@ def test_cross_validation_needs_a_search(searched: optuna.Study) -> None:
     assert not Path("elsewhere").exists()
 
 
-def test_baselines_and_operators(folder: Path, executor: Planted) -> None:
+def test_baselines(folder: Path, executor: Planted) -> None:
     write_search(folder, MATRICES)
     executor.fails = lambda run: run.aux_loss is not None and "[" in run.aux_loss and run.seed == 1
     output = run("baselines", "small.yml", code=1)
@@ -335,10 +332,6 @@ def test_baselines_and_operators(folder: Path, executor: Planted) -> None:
     assert re.search(r"SAC\W+1\.500\W+1\.500\W+0\.707\W+2 ", output)
     assert output.splitlines()[-1] == "Failed: CURL on Pendulum-v1, seed 1: it burst"
     assert len(read_curve(Path("runs/small/baselines/SAC/Pendulum-v1/seed-1/curve.csv"))) == 2
-    executor.scores = {str(catalog.load("forward-dynamics")): 9.0}
-    output = run("select-operator", "small.yml")
-    first = next(line for line in output.splitlines() if "negative samples" in line)
-    assert "mse, w/o negative samples" in first and "1.000" in first and output.count("negative samples") == 10
 
 
 def test_baselines_and_other_environments_are_tried_out(folder: Path, executor: Planted, searched: optuna.Study) -> None:

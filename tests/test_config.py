@@ -69,10 +69,6 @@ def test_the_papers_budgets(path: Path) -> None:
         assert steps == (short if pixel or "cheetah" in env_id else long)
         assert config.hyperparameters_for(env_id).get("env_kwargs", {}).get("pixels", False) is pixel
     assert len(config.baselines) == 3
-    assert (config.operator_selection is not None) is pixel
-    if config.operator_selection is not None:
-        assert config.operator_selection.environments == environments
-        assert len(config.operator_selection.seeds) == 5
 
 
 @pytest.mark.parametrize("path", [path for path in SEARCHES if path.stem.endswith("-small")], ids=lambda path: path.stem)
@@ -141,7 +137,6 @@ def test_every_part_of_a_search_is_read(tmp_path: Path) -> None:
             "top": 2,
             "checkpoints": {"Pendulum-v1": [200]},
         },
-        "operator_selection": {"environments": ["dm_control/cheetah-run-v0"], "seeds": [1, 2]},
         "baselines": [
             {"name": "a", "aux_loss": "{s_t} -> {r_t}"},
             {"name": "b", "aux_loss": None, "overrides": {"policy_kwargs": {"features_extractor_class": "identity"}}},
@@ -155,7 +150,6 @@ def test_every_part_of_a_search_is_read(tmp_path: Path) -> None:
     assert config.cross_validation == CrossValidation(
         environments=(walker, "Pendulum-v1"), seeds=(3,), top=2, checkpoints={"Pendulum-v1": (200,)}
     )
-    assert config.operator_selection is not None and config.operator_selection.seeds == (1, 2)
     assert config.baselines[0] == Baseline(name="a", aux_loss=REWARD)
     assert [baseline.aux_loss for baseline in config.baselines[1:]] == [None, None]
     assert config.operators == ("mse", "inner")

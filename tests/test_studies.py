@@ -16,7 +16,7 @@ from sb3_aarl.search.evolution.space import distributions, loss_to_params, rando
 from sb3_aarl.search.evolution.surrogate import features
 from sb3_aarl.search.execution.driver import SearchProgress
 from sb3_aarl.search.execution.matrix import Cell
-from sb3_aarl.search.studies import cross_validation, operator_selection
+from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.config import SearchConfig, load_config
 from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, runs_of
 from sb3_aarl.search.training import config as training
@@ -32,9 +32,6 @@ cross_validation:
   seeds: [1, 2]
   top: 2
   checkpoints: {MountainCarContinuous-v0: [100]}
-operator_selection:
-  environments: [Pendulum-v1]
-  seeds: [0, 1]
 baselines:
 - {name: CURL, aux_loss: curl}
 - {name: SAC, overrides: {gamma: 0.9}}
@@ -228,34 +225,3 @@ def test_a_ranking_deviates_over_seeds_not_over_environments(tmp_path: Path) -> 
     assert row["std"] == pytest.approx(np.std([499.0, 503.0], ddof=1))
     assert cross_validation.write_winner(table, tmp_path / "winner.yml") == LOSSES[0]
     assert catalog.resolve(tmp_path / "winner.yml") == LOSSES[0]
-
-
-def test_ten_operators_on_forward_dynamics(config: SearchConfig, tmp_path: Path) -> None:
-    matrix = operator_selection.make_matrix(config, tmp_path)
-    assert len(matrix.runs) == 10 * 2 and matrix.folder == tmp_path / "operators"
-    losses = {AuxLoss.parse(str(run.aux_loss)) for run in matrix.runs.values()}
-    assert len(losses) == 10 and len({(loss.source, loss.target) for loss in losses}) == 1
-    with pytest.raises(ConfigError, match="operator_selection is missing"):
-        operator_selection.make_matrix(config.model_copy(update={"operator_selection": None}), tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("returns", "expected"),
-    [
-        # Mean of both -600, -200: each divided by that, its sign kept. Sample deviations of two numbers.
-        ({"a": [-300.0, -100.0], "b": [-900.0, -300.0]}, {"a": (-0.5, 0.0), "b": (-1.5, 0.0)}),
-        # 200 and -600: a is 0.5 and -0.5, b 1.5 and -1.5.
-        ({"a": [100.0, -300.0], "b": [300.0, -900.0]}, {"a": (0.0, 0.5 * 2**0.5), "b": (0.0, 1.5 * 2**0.5)}),
-        ({"a": [100.0, 30.0], "b": [300.0, 90.0]}, {"b": (1.0, 0.0), "a": (1 / 3, 0.0)}),
-        ({"a": [0.0, 0.0], "b": [0.0, 0.0]}, {"a": (0.0, 0.0), "b": (0.0, 0.0)}),
-    ],
-    ids=["negative", "both signs", "positive", "zero"],
-)
-def test_normalized_returns_rank_the_higher_one_first(
-    returns: dict[str, list[float]], expected: dict[str, tuple[float, float]]
-) -> None:
-    rows = [(variant, task, last) for variant, values in returns.items() for task, last in zip("xy", values, strict=True)]
-    table = operator_selection.table(pd.DataFrame(rows, columns=["variant", "environment", "last"]))
-    assert list(table.index) == list(expected)
-    for variant, numbers in expected.items():
-        assert tuple(table.loc[variant, ["mean", "std"]]) == pytest.approx(numbers)

@@ -14,6 +14,7 @@ import pytest
 from rich.console import Console
 from sb3_aarl.search.execution.matrix import Cell, cell_folder
 from sb3_aarl.search.results import table
+from sb3_aarl.search.studies.benchmark import read_variants
 from sb3_aarl.search.training.provenance import ABOUT
 from scipy import stats
 
@@ -22,6 +23,12 @@ from sb3_aarl.envs import env_ids
 
 # The paper's tables as its text has them; table 3 and the first part of table 4 have the asterisks and daggers left out.
 PAPER = {
+    (2, 500_000): """
+Inner, negatives | Bilinear, negatives | Cosine, negatives | MSE, negatives | N-MSE, negatives \
+| Inner | Bilinear | Cosine | MSE | N-MSE
+normalized | 0.979 ± 0.344 | 0.953 ± 0.329 | 0.872 ± 0.412 | 0.124 ± 0.125 | 0.933 ± 0.360 \
+| 0.669 ± 0.311 | 0.707 ± 0.299 | 0.959 ± 0.225 | 1.000 ± 0.223 | 0.993 ± 0.229
+""",
     (3, 500_000): """
 AARL-Pixel | CURL | PlaNet | Dreamer | SAC+AE | SLACv1 | Pixel SAC
 Finger-Spin | 983 ± 4 | 926 ± 45 | 561 ± 284 | 796 ± 183 | 884 ± 128 | 673 ± 92 | 282 ± 102
@@ -79,7 +86,7 @@ def environment_id(task: str) -> str:
     return f"dm_control/{task.lower().replace(' ', '_').replace('quadraped', 'quadruped')}-v0"
 
 
-@pytest.mark.parametrize("number", [3, 4, 6])
+@pytest.mark.parametrize("number", [2, 3, 4, 6])
 def test_the_papers_scores_are_those_that_it_prints(number: int) -> None:
     printed = set()
     for (of_table, checkpoint), text in PAPER.items():
@@ -92,9 +99,10 @@ def test_the_papers_scores_are_those_that_it_prints(number: int) -> None:
     columns = ["checkpoint", "environment", "column", "mean", "std"]
     assert len(scores) == len(printed)
     assert set(scores[columns].itertuples(index=False, name=None)) == printed
-    assert set(scores["runs"]) == {{3: 10, 4: 10, 6: 30}[number]}
+    assert set(scores["runs"]) == {{2: 15, 3: 10, 4: 10, 6: 30}[number]}
     assert set(scores["environment"]) <= {*env_ids(), "normalized"}
-    zoo = {path.stem for path in (Path(__file__).parent.parent / "zoo_configs/paper").glob("*.yml")}
+    files = (Path(__file__).parent.parent / "zoo_configs/paper").glob("*.yml")
+    zoo = {variant.name for file in files for variant in read_variants(file)}
     assert set(scores["variant"].dropna()) <= zoo
 
 
@@ -327,6 +335,25 @@ def test_one_run_has_neither_deviation_nor_interval_nor_mark(tmp_path: Path) -> 
     assert "│ cheetah-run │ 1 │ 472 ± 30 │" in printed(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        # Mean of both -600, -200: each divided by that, its sign kept. Sample deviations of two numbers.
+        ({"a": [-300.0, -100.0], "b": [-900.0, -300.0]}, {"a": (-0.5, 0.0), "b": (-1.5, 0.0)}),
+        # 200 and -600: a is 0.5 and -0.5, b 1.5 and -1.5.
+        ({"a": [100.0, -300.0], "b": [300.0, -900.0]}, {"a": (0.0, 0.5 * 2**0.5), "b": (0.0, 1.5 * 2**0.5)}),
+        ({"a": [100.0, 30.0], "b": [300.0, 90.0]}, {"b": (1.0, 0.0), "a": (1 / 3, 0.0)}),
+        ({"a": [0.0, 0.0], "b": [0.0, 0.0]}, {"a": (0.0, 0.0), "b": (0.0, 0.0)}),
+    ],
+    ids=["negative", "both signs", "positive", "zero"],
+)
+def test_normalized_returns(returns: dict[str, list[float]], expected: dict[str, tuple[float, float]]) -> None:
+    rows = [(variant, task, last) for variant, values in returns.items() for task, last in zip("xy", values, strict=True)]
+    result = table.normalized(pd.DataFrame(rows, columns=["variant", "environment", "mean"]))
+    for variant, numbers in expected.items():
+        assert tuple(result.loc[variant]) == pytest.approx(numbers)
+
+
 def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
     returns = {
         "aarl_state": {CHEETAH: [400.0, 480.0], WALKER: [900.0, 910.0]},
@@ -353,7 +380,7 @@ def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
         ""
     }
     shown = printed(tmp_path)
-    assert "100K steps scores, without the paper's: normalized by other variants than its four" in shown
+    assert "100K steps scores, without the paper's: normalized by other variants than its own" in shown
     assert "1.000 ± 0.12" not in shown and "aarl_mlp_4 on walker-walk, seed 1: it burst" in shown
 
     write_curve(failed / "curve.csv", [Evaluation(100_000, 310.0, 1.0, 10, 2.0)])

@@ -1,4 +1,4 @@
-"""Commands that train a matrix of runs and show its tables: baselines, cross-validation, operator selection, benchmark."""
+"""Commands that train a matrix of runs and show its tables: baselines, cross-validation, benchmark."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -91,21 +91,6 @@ def baselines(
     matrix = search.baselines(settings, found.folder)
     train_matrix(matrix, workers, settings.retries, config)
     compare(matrix, ranking, "Baselines, AULC", json)
-    exit_if_failed(matrix)
-
-
-@app.command(rich_help_panel="A search")
-def select_operator(
-    config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
-) -> None:
-    """Compare the ten operators on forward dynamics, as in the paper's table 2."""
-    from sb3_aarl.search.studies import operator_selection
-    from sb3_aarl.search.studies.search import Search
-
-    found = Search.from_file(config, folder, threads=threads)
-    matrix = operator_selection.make_matrix(found.config, found.folder)
-    train_matrix(matrix, workers, found.config.retries, config)
-    compare(matrix, operator_selection.table, "Normalized returns at the last checkpoint (paper, table 2)", json)
     exit_if_failed(matrix)
 
 

@@ -1,4 +1,4 @@
-"""A benchmark's runs in the layout of the paper's tables 3, 4 and 6, beside the paper's numbers, with rliable's statistics."""
+"""A benchmark's runs in the layout of tables 2, 3, 4 and 6 of the paper, beside its numbers, with rliable's statistics."""
 
 import json
 import math
@@ -14,7 +14,6 @@ from rich.markup import escape
 from rich.table import Table
 from sb3_aarl.search.execution.matrix import comparable, task_name
 from sb3_aarl.search.results.statistics import SUITE, improvements, interquartile_means
-from sb3_aarl.search.studies import operator_selection
 from sb3_aarl.search.studies.benchmark import read_abouts
 from sb3_aarl.search.training.folder import FAILED, partial_curve
 
@@ -23,7 +22,7 @@ from sb3_aarl.envs import PREFIX
 # A difference is marked from so many standard errors on.
 STANDARD_ERRORS = 2.0
 MARKS = {"higher": "▲", "lower": "▼", "": ""}
-# The row of table 6, which has no environments.
+# The row of tables 2 and 6, which have no environments.
 NORMALIZED = "normalized"
 # With more variants than that they go down the rows, and of their pairs those with the best one are shown.
 MANY = 6
@@ -109,14 +108,13 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     means, 2 sqrt(s^2 / n + S^2 / N), with s and n of the runs here, S and N of the paper's table; the paper does not say
     which deviation it prints. With one run here there is no s, and no mark.
 
-    For table 6 the returns are normalized as for table 2, see
-    :func:`sb3_aarl.search.studies.operator_selection.table`, over the variants that are complete: if these are not the
-    paper's four, no number of the paper stands beside them. N is 5 seeds x 6 environments there, so both deviations
-    contain the difference of the environments: the test is a cautious one.
+    For tables 2 and 6 the returns are normalized, see :func:`normalized`, over the variants that are complete: if these are
+    not the paper's, its numbers are left out. N is 5 seeds x 3 or 6 environments there, so both deviations contain the
+    difference of the environments: the test is a cautious one.
     """
     keys = ["checkpoint", "environment", "variant"]
     numbers = ["paper_mean", "paper_std", "paper_runs"]
-    if number == 6:
+    if number in (2, 6):
         result = _normalized(runs)
     else:
         by_task = runs.groupby(keys, sort=False)["mean"]
@@ -130,7 +128,7 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     result["column"] = [headings.get(name, variant) for name, variant in names]
     result = result.merge(paper, on=[*keys[:2], "paper_variant"], how="left")
     for _, part in result.groupby("checkpoint"):
-        if not _is_comparable(part):
+        if not _is_comparable(part, number):
             result.loc[part.index, numbers] = math.nan
     result["difference"] = result["mean"] - result["paper_mean"]
     variance = result["std"] ** 2 / result["runs"] + result["paper_std"] ** 2 / result["paper_runs"]
@@ -140,11 +138,11 @@ def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
     return result[[*keys, "planned", "runs", "mean", "std", "column", *numbers, "difference", "standard_error", "mark"]]
 
 
-def _is_comparable(comparison: pd.DataFrame) -> bool:
+def _is_comparable(comparison: pd.DataFrame, number: int | None) -> bool:
     """Whether the scores of a checkpoint can be compared with the paper's: not if they are normalized by other variants."""
     is_normalized = (comparison["environment"] == NORMALIZED).any()
     variants = sorted(comparison.dropna(subset="mean")["variant"].str.removesuffix(BF16))
-    return not is_normalized or variants == sorted(_paper()[6]["columns"].values())
+    return not is_normalized or variants == sorted(_paper()[number or 6]["columns"].values())
 
 
 def _normalized(runs: pd.DataFrame) -> pd.DataFrame:
@@ -152,12 +150,25 @@ def _normalized(runs: pd.DataFrame) -> pd.DataFrame:
     parts = []
     for checkpoint, part in runs.groupby("checkpoint"):
         n_runs = part.groupby("variant", sort=False)["mean"].count()
-        complete = comparable(part.dropna(subset="mean")).rename(columns={"mean": "last"})
         n_planned = len(part[["environment", "seed"]].drop_duplicates())
-        table = operator_selection.table(complete).reindex(n_runs.index)
+        table = normalized(comparable(part.dropna(subset="mean"))).reindex(n_runs.index)
         table = table.assign(runs=n_runs, planned=n_planned, checkpoint=checkpoint, environment=NORMALIZED)
         parts.append(table.reset_index())
     return pd.concat(parts, ignore_index=True)
+
+
+def normalized(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    Mean and sample deviation of normalized returns over all environments and seeds, for each variant.
+
+    The paper does not say how returns are normalized. Here each is divided by the size of the mean of all variants on
+    its environment, so that environments count alike and higher is better even if returns are negative, and then all by
+    the best variant's mean, so that this is 1; unless it is negative.
+    """
+    scale = runs.groupby("environment")["mean"].transform("mean").abs()
+    result = (runs["mean"] / scale.where(scale != 0, 1.0)).groupby(runs["variant"]).agg(["mean", "std"])
+    best = result["mean"].max()
+    return result / best if best > 0 else result
 
 
 def missing(runs: pd.DataFrame) -> list[str]:
@@ -205,14 +216,14 @@ def read_tables(folder: Path, number: int | None = None) -> Tables:
 
 def terminal_tables(tables: Tables) -> list[Table]:
     """The scores in the layout of the paper, then the statistics over tasks, for each checkpoint."""
-    return [*_score_tables(tables.comparison), *_statistics_tables(tables.iqm, tables.better)]
+    return [*_score_tables(tables.comparison, tables.number), *_statistics_tables(tables.iqm, tables.better)]
 
 
-def _score_tables(comparison: pd.DataFrame) -> list[Table]:
+def _score_tables(comparison: pd.DataFrame, number: int | None) -> list[Table]:
     """For each checkpoint tasks and variants, the fewer as columns, the paper's score beside each."""
     tables = []
     for checkpoint, part in comparison.groupby("checkpoint"):
-        problem = "" if _is_comparable(part) else ", without the paper's: normalized by other variants than its four"
+        problem = "" if _is_comparable(part, number) else ", without the paper's: normalized by other variants than its own"
         table = Table("", title=f"{_steps(checkpoint)} steps scores{problem}")
         variant_names = [
             (variant, variant if heading == variant else f"{heading}\n{variant}")

@@ -77,13 +77,6 @@ class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     checkpoints: dict[Environment, Checkpoints] = {}
 
 
-class OperatorSelection(BaseModel, frozen=True, extra="forbid"):
-    """Comparison of the ten operators (paper, A.1.3)."""
-
-    environments: Environments
-    seeds: Seeds = (0, 1, 2, 3, 4)
-
-
 class Baseline(BaseModel, frozen=True, extra="forbid"):
     """
     A run that the candidates are compared with (the lines of the paper's figures 4 and 6), with overrides merged over the
@@ -115,7 +108,6 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     :param threads: PyTorch's threads of a run; they change the last bits of a result
     :param pruner: ``none``, ``median`` or ``hyperband``
     :param cross_validation: Cross-validation, None where the configuration has none
-    :param operator_selection: Operator selection, None where the configuration has none
     :param baselines: Runs that the candidates are compared with
     :param overrides: Merged over the hyper-parameters of all runs
     """
@@ -147,7 +139,6 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     threads: PositiveInt = 1
     pruner: Literal["none", "median", "hyperband"] = "none"
     cross_validation: CrossValidation | None = None
-    operator_selection: OperatorSelection | None = None
     baselines: tuple[Baseline, ...] = ()
     overrides: Overrides = {}
     # The file of hyper-parameters, read once, and checked hyper-parameters by environment and baseline.
@@ -234,9 +225,8 @@ def load_config(path: str | Path, **changes: Any) -> SearchConfig:
         raise ConfigError(f"{path}: {error}") from None
     others = config.cross_validation.checkpoints if config.cross_validation else {}
     validated = config.cross_validation.environments if config.cross_validation else ()
-    own = [config.environment, *(config.operator_selection.environments if config.operator_selection else ())]
-    for env_id in dict.fromkeys([*own, *validated]):
+    for env_id in dict.fromkeys([config.environment, *validated]):
         for baseline in (None, *(config.baselines if env_id == config.environment else ())):
-            steps = {*others.get(env_id, config.checkpoints), *(config.checkpoints if env_id in own else ())}
+            steps = {*others.get(env_id, config.checkpoints), *(config.checkpoints if env_id == config.environment else ())}
             check_checkpoints(steps, config.hyperparameters_for(env_id, baseline), f"{path}: {env_id}")
     return config
