@@ -1,4 +1,4 @@
-"""Notes and plots for optuna-dashboard, read through its own functions and in a real browser."""
+"""Notes for optuna-dashboard, read through its own functions and in a real browser."""
 
 import socket
 import threading
@@ -18,7 +18,6 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 EVIL = "<script>document.title='owned'</script> ![x](https://example.org/x.png) **bold** | `code`\n# www.example.org"
-BASELINES = [("SAC", 90.0), ("CURL", 110.0)]
 
 
 def test_note_of_a_trial():
@@ -38,16 +37,6 @@ def written(trial, attributes):
     return optuna_dashboard.get_note(trial)
 
 
-def test_plot_is_replaced():
-    study = optuna.create_study()
-    for baselines in (BASELINES, []):
-        dashboard.update_plots(study, baselines)
-        attrs = study._storage.get_study_system_attrs(study._study_id)
-        plots = optuna_dashboard._custom_plot_data.get_plotly_graph_objects(attrs)
-        assert list(plots) == ["evolution"]
-        assert ("CURL" in plots["evolution"]) == bool(baselines)
-
-
 def search_in_miniature(storage):
     """A finished search of two generations with a failed trial, annotated as its driver does."""
     sampler = AuxLossSampler(population_size=6, n_random=4, n_prior=2, seed=0, n_generations=2)
@@ -62,8 +51,7 @@ def search_in_miniature(storage):
             trial.set_user_attr("reason", EVIL)
         dashboard.annotate_trial(trial)
         study.tell(trial, *([None, TrialState.FAIL] if trial.number == 2 else [score]))
-    optuna_dashboard.save_note(study, dashboard.HOW_TO_READ)
-    dashboard.update_plots(study, BASELINES)
+    dashboard.annotate_study(study)
     return study
 
 
@@ -79,9 +67,7 @@ def test_in_a_real_browser(tmp_path):
     storage = open_storage(tmp_path)
     study = search_in_miniature(storage)
     trials = study.get_trials(deepcopy=False)
-    completed = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    assert len(completed) == 12
-    child = next(trial for trial in completed if trial.user_attrs["parents"])
+    child = next(trial for trial in trials if trial.user_attrs["parents"])
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -95,13 +81,6 @@ def test_in_a_real_browser(tmp_path):
 
         def text():
             return browser.find_element(By.TAG_NAME, "body").text
-
-        browser.get(f"{url}/dashboard/studies/{study._study_id}")
-        plot_id = f"user-defined-plot:{dashboard.PLOT_ID}"
-        points = f"[id='{plot_id}'] .scatterlayer .trace:first-child .points path"
-        wait.until(lambda _: len(browser.find_elements(By.CSS_SELECTOR, points)) == len(completed))
-        plot = browser.find_element(By.ID, plot_id).text
-        assert all(name in plot for name in ("Evolution of auxiliary losses", "Generation", "SAC", "CURL"))
 
         browser.get(f"{url}/dashboard/studies/{study._study_id}/note")
         wait.until(lambda _: "Each trial trains one candidate" in text())

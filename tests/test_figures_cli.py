@@ -121,7 +121,7 @@ def test_analyze_prints_all_tables_as_data(study: optuna.Study) -> None:
     assert data["importances"][0]["parameter"] == "source/s_t"
     best = max(done, key=lambda trial: trial.value)
     assert [row["number"] for row in data["lineage"]] == [best.number]
-    assert all(row["spearman"] == pytest.approx(1.0) for row in data["rank_agreement"])
+    assert all(row["aulc"] == pytest.approx(1.0) for row in data["rank_agreement"])
     assert data["problems"] == {} and data["machines"][0]["device"] == "CPU: some"
 
 
@@ -151,11 +151,12 @@ def test_analyze_compares_studies(study: optuna.Study) -> None:
         (["analyze", "other", "--storage", "sqlite:///runs/one/study.db"], "no study 'other'. The storage has: one"),
         (["analyze", "--pattern", "{s_t}"], "{s_t}"),
         (["figures", "patterns", "--pattern", "curll"], "nearest: curl"),
+        (["figures", "patterns", "runs/one", "two"], "figures patterns takes one folder"),
         (["figures", "evolution", "--out", "x.txt"], "Format 'txt' is not supported"),
         (["figures", "curves"], "runs/benchmark has no learning curves"),
         (["figures", "evolution", "runs/benchmark"], "runs/benchmark has no search"),
     ],
-    ids=["folder", "study", "pattern", "name", "kind", "benchmark", "no search"],
+    ids=["folder", "study", "pattern", "name", "folders", "kind", "benchmark", "no search"],
 )
 def test_what_cannot_be_shown_is_one_line(study: optuna.Study, arguments: list[str], message: str) -> None:
     error = run(*arguments, fails=True)
@@ -169,7 +170,7 @@ def test_figures_of_a_search(study: optuna.Study, name: str) -> None:
     assert Path(f"runs/one/{name}.png").read_bytes().startswith(b"\x89PNG")
     run("figures", name, "runs/one", "--out", "deep/figure.svg")
     written = texts(Path("deep/figure.svg"))
-    assert "60 candidates (left out: 1 failed)" in written
+    assert ("10 candidates" if name == "rankings" else "60 candidates (left out: 1 failed)") in written
     if name == "evolution":
         assert "SAC" in written and "CURL $x_{" in written
     if name == "patterns":
@@ -178,7 +179,7 @@ def test_figures_of_a_search(study: optuna.Study, name: str) -> None:
 
 
 def test_figures_of_several_searches(study: optuna.Study) -> None:
-    for name in ("evolution", "histogram", "patterns"):
+    for name in ("evolution", "histogram"):
         run("figures", name, "runs/one", "two", "--out", f"{name}.svg")
         written = texts(Path(f"{name}.svg"))
         assert all(re.search(rf"\b{title}\b", written) for title in ("one", "two"))

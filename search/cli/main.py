@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 # Training alone does without these modules; the extra that has them.
 EXTRAS = {"imageio": "search", "psycopg": "postgres", "ray": "ray", "submitit": "slurm"}
-OF_SEARCH = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "plotly", "scipy", "sklearn", "sqlalchemy", "tenacity")
+OF_SEARCH = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "scipy", "sklearn", "sqlalchemy", "tenacity")
 
 
 class Program(TyperGroup):

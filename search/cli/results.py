@@ -25,7 +25,7 @@ ANALYSES = {
     "operation": "Scores by operation; difference to all others",
     "diversity": "Diversity of the generations",
     "lineage": "Lineage of the best; gain over the better parent",
-    "rank_agreement": "Agreement of the metrics; shared among the best 10",
+    "rank_agreement": "Rank correlations of the metrics (Spearman)",
     "machines": "Machines and time",
 }
 N_IMPORTANCES = 20
@@ -172,17 +172,9 @@ def dashboard(
 ) -> None:
     """Watch a search in optuna-dashboard. Everybody who reaches it can change and delete studies."""
     from optuna_dashboard import run_server
-    from sb3_aarl.search.execution.storage import load_study, open_storage
-    from sb3_aarl.search.results.dashboard import update_plots
-    from sb3_aarl.search.results.report import stored_baselines
-    from sb3_aarl.search.studies.search import SETTINGS_KEY
+    from sb3_aarl.search.execution.storage import open_storage
 
-    path = search_folder(folder or search, storage)
-    opened = open_storage(path, storage, create=False)
-    for name in (found.study_name for found in opened.get_all_studies()):
-        study = load_study(opened, name)
-        if SETTINGS_KEY in study.user_attrs:  # a search; baselines may have been trained since its last plot
-            update_plots(study, stored_baselines(Path("runs") / name if path is None or name != path.name else path))
+    opened = open_storage(search_folder(folder or search, storage), storage, create=False)
     say(f"http://{host}:{port}/  (Ctrl-C to stop; --port for another port)")
     with suppress(KeyboardInterrupt):
         run_server(opened, host=host, port=port)
@@ -220,7 +212,7 @@ def figures(
 
     if pattern and kind != "patterns":
         raise ValueError("--pattern is for aarl figures patterns")
-    if kind in ("curves", "rankings") and len(folders or ()) > 1:
+    if kind in ("curves", "rankings", "patterns") and len(folders or ()) > 1:
         raise ValueError(f"aarl figures {kind} takes one folder")
     if kind == "curves":
         folder = folders[0] if folders else options.BENCHMARK
@@ -229,16 +221,17 @@ def figures(
         return
     studies = open_studies(folders, storage)
     tables = {name: analysis.trial_table(study.get_trials(deepcopy=False)) for name, (study, _) in studies.items()}
-    first, folder = next(iter(studies.values()))
+    study, folder = next(iter(studies.values()))
+    table = next(iter(tables.values()))
     if kind == "evolution":
         lines = {name: stored_baselines(path) for name, (_, path) in studies.items()}
-        figure = plots.evolution_plot(tables, lines, first.direction)
+        figure = plots.evolution_plot(tables, lines, study.direction)
     elif kind == "histogram":
         figure = plots.histogram_plot(tables)
     elif kind == "rankings":
-        figure = plots.rankings_plot(next(iter(tables.values())))
+        figure = plots.learning_curves_plot(analysis.leaders(table), "candidate")
     else:
-        figure = plots.patterns_plot(tables, {**analysis.PATTERNS, **{text: text for text in pattern or ()}})
+        figure = plots.patterns_plot(table, {**analysis.PATTERNS, **{text: text for text in pattern or ()}})
     write_figure(figure, out or folder / f"{kind}.png")
 
 

@@ -3,7 +3,6 @@
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,9 +40,6 @@ COLUMNS: dict[str, Any] = {
     **{"loss": object, "canonical": object, "horizon": "Int64", "operator": object, "negatives": "boolean", "curve": object},
 }
 
-# Of a learning curve: the mean of all evaluations, the first, the last (paper, B.2, figure 10).
-METRICS = ("aulc", "first", "last")
-
 
 def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
@@ -73,15 +69,6 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
 def ranked(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
     """The trials that have a score, the best first; of equals those with lower numbers."""
     return table.dropna(subset="score").sort_values("score", ascending=direction == StudyDirection.MINIMIZE, kind="stable")
-
-
-def lineage(number: int, table: pd.DataFrame) -> pd.DataFrame:
-    """A trial and all its ancestors, the latest first."""
-    wanted = {number}
-    for earlier in range(number, -1, -1):
-        if earlier in wanted:
-            wanted |= set(table["parents"][earlier])
-    return table.loc[sorted(wanted, reverse=True)]
 
 
 def analysed(table: pd.DataFrame) -> pd.DataFrame:
@@ -135,6 +122,14 @@ def table5_classes(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = 
     return pd.DataFrame(columns, index=losses.index, dtype="boolean")
 
 
+def pattern_scores(
+    table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS
+) -> dict[str, tuple[pd.Series, pd.Series]]:
+    """The scores of the trials with and of those without each pattern, those in neither class left out."""
+    scores, classes = analysed(table)["score"], table5_classes(table, patterns)
+    return {name: (scores[classes[name].fillna(False)], scores[~classes[name].fillna(True)]) for name in classes}
+
+
 def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS) -> pd.DataFrame:
     """
     Whether losses with a pattern score otherwise than those without it (paper, section 3.3, table 5).
@@ -143,16 +138,10 @@ def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS
     each other, and later generations score higher and have other patterns. So p-values are lower than those of an
     experiment, and they are not corrected for the number of tests.
     """
-    scores = analysed(table)["score"]
-    classes = table5_classes(table, patterns)
-    rows = {}
-    for name in classes:
-        column = classes[name]
-        comparison = _compare(scores[column.fillna(False)], scores[~column.fillna(True)])
-        rows[name] = {**comparison, "n_neither": int(column.isna().sum())}
-    counts = ["n_with", "n_without", "n_neither"]
-    columns = ["difference", "welch_p", "mean_with", "mean_without", *counts]
-    return pd.DataFrame.from_dict(rows, orient="index", columns=columns).astype(dict.fromkeys(counts, int))
+    rows = {name: _compare(*scores) for name, scores in pattern_scores(table, patterns).items()}
+    result = pd.DataFrame.from_dict(rows, orient="index")
+    result["n_neither"] = len(analysed(table)) - result["n_with"] - result["n_without"]
+    return result
 
 
 def _compare(scores_with: pd.Series, scores_without: pd.Series) -> dict[str, float]:
@@ -161,9 +150,14 @@ def _compare(scores_with: pd.Series, scores_without: pd.Series) -> dict[str, flo
         warnings.simplefilter("ignore", RuntimeWarning)
         welch = ttest_ind(scores_with, scores_without, equal_var=False).pvalue
     mean_with, mean_without = scores_with.mean(), scores_without.mean()
-    means = {"difference": mean_with - mean_without, "mean_with": mean_with, "mean_without": mean_without}
-    counts = {"n_with": len(scores_with), "n_without": len(scores_without)}
-    return {**means, **counts, "welch_p": float(welch)}
+    return {
+        "difference": mean_with - mean_without,
+        "welch_p": float(welch),
+        "mean_with": mean_with,
+        "mean_without": mean_without,
+        "n_with": len(scores_with),
+        "n_without": len(scores_without),
+    }
 
 
 def table5_layout(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
@@ -239,7 +233,7 @@ def diversity(table: pd.DataFrame) -> pd.DataFrame:
 def rankings(table: pd.DataFrame) -> pd.DataFrame:
     """
     The trials of :func:`analysed` that have a curve, with their scores under the metrics: AULC, and the mean returns at the
-    first and the last checkpoint. Of equals :meth:`pandas.DataFrame.nlargest` takes those with lower numbers.
+    first and the last checkpoint.
     """
     trials = table[table["curve"].map(len) > 0]
     if trials.empty:
@@ -250,26 +244,26 @@ def rankings(table: pd.DataFrame) -> pd.DataFrame:
     return trials[["number", "curve"]].assign(aulc=returns.mean(axis=1), first=returns[:, 0], last=returns[:, -1])
 
 
-def rank_agreement(ranking: pd.DataFrame, top: int = 10) -> pd.DataFrame:
-    """
-    How far the three metrics agree on which losses are good: one row a pair of metrics with ``spearman`` and ``kendall`` (rank
-    correlations over all trials), and ``shared``: how many trials are among the best ``top`` under both.
-    """
-    rows = {}
-    for pair in combinations(METRICS, 2):
-        first, second = (ranking[metric] for metric in pair)
-        leaders = [set(ranking.nlargest(top, metric)["number"]) for metric in pair]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # too few trials, or all alike: NaN
-            correlations = {method: first.corr(second, method=method) for method in ("spearman", "kendall")}
-        rows[pair] = {**correlations, "shared": len(leaders[0] & leaders[1])}
-    return pd.DataFrame.from_dict(rows, orient="index")
+def leaders(table: pd.DataFrame, top: int = 10) -> pd.DataFrame:
+    """The learning curves of the best trials under each metric, for ``learning_curves_plot`` (paper, B.2, figure 10)."""
+    ranking = rankings(analysed(table))
+    names = {"aulc": "by AULC", "first": "by the first evaluation", "last": "by the last evaluation"}
+    rows = [
+        (name, f"The best {top} candidates", row.number, *point)
+        for metric, name in names.items()
+        for row in ranking.nlargest(top, metric).itertuples()
+        for point in row.curve
+    ]
+    return pd.DataFrame(rows, columns=["variant", "env", "seed", "environment_steps", "mean", "std"])
 
 
-def winner_lineage(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
+def lineage(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
     """The best trial and all its ancestors, the latest first; ``gain`` is the score less that of the best parent."""
-    best = ranked(table, direction)["number"].tolist()
-    line = (lineage(best[0], table) if best else table[:0]).set_index("number")
+    wanted = set(ranked(table, direction)["number"][:1])
+    for number in range(max(wanted, default=-1), -1, -1):
+        if number in wanted:
+            wanted |= set(table["parents"][number])
+    line = table.loc[sorted(wanted, reverse=True)].set_index("number")
     best_of = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
     parents = [best_of(table["score"][numbers]) if numbers else np.nan for numbers in line["parents"]]
     line["gain"] = line["score"] - np.array(parents, dtype=float)
@@ -315,7 +309,7 @@ def summary(
         "horizon": effects(table, "horizon"),
         "operation": effects(table, "operation"),
         "diversity": diversity(table),
-        "lineage": winner_lineage(table, direction),
+        "lineage": lineage(table, direction),
         "machines": machines(trials),
     }
     if len(analysed(table)[operator].drop_duplicates()) > 1:
@@ -326,7 +320,8 @@ def summary(
     except ValueError as error:
         problems["importances"] = str(error)
     try:
-        tables["rank_agreement"] = rank_agreement(rankings(analysed(table))).rename_axis(["metric", "other metric"])
+        ranking = rankings(analysed(table))
+        tables["rank_agreement"] = ranking[["aulc", "first", "last"]].corr("spearman").rename_axis("metric")
     except ValueError as error:
         problems["rank_agreement"] = str(error)
     return Summary(tables, problems)

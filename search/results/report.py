@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from optuna import Study
 from sb3_aarl.search.execution.matrix import comparable, stored_scores, task_name
 from sb3_aarl.search.results import analysis
-from sb3_aarl.search.results.plots import evolution_plot, patterns_plot, rankings_plot
+from sb3_aarl.search.results.plots import evolution_plot, learning_curves_plot, patterns_plot
 from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.search import stored_settings
 from sb3_aarl.search.training.provenance import provenance
@@ -52,6 +52,7 @@ def write_report(
     title, baselines = study.study_name, list(baselines)
     summary = analysis.summary(trials, study.direction)
     n_analysed = len(analysis.analysed(table))
+    leaders = None if "rank_agreement" in summary.problems else analysis.leaders(table)
     started = [f"{trial.datetime_start:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_start]
     ended = [f"{trial.datetime_complete:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_complete]
     environment = jinja2.Environment(
@@ -67,13 +68,13 @@ def write_report(
         evolution=_picture(evolution_plot({title: table}, {title: baselines}, study.direction)) if len(best) else None,
         best=_candidates(best[:N_BEST]),
         winner=_candidates(best[:1]).to_dict("records"),
-        lineage=_candidates(analysis.lineage(best["number"].iloc[0], table)[1:]) if len(best) else None,
+        lineage=_candidates(table.loc[summary.tables["lineage"].index[1:]]) if len(best) else None,
         validation=_validation(validation),
         n_analysed=n_analysed,
         tables={name: analysis.readable(name, frame) for name, frame in summary.tables.items()},
         problems=summary.problems,
-        patterns=_picture(patterns_plot({title: table})) if n_analysed else None,
-        rankings=None if "rank_agreement" in summary.problems else _picture(rankings_plot(table)),
+        patterns=_picture(patterns_plot(table)) if n_analysed else None,
+        leaders=_picture(learning_curves_plot(leaders, "candidate")) if leaders is not None else None,
         started=min(started, default=""),
         ended=max(ended, default=""),
         versions=Counter(trial.user_attrs["versions"] for trial in trials if "versions" in trial.user_attrs),

@@ -146,14 +146,14 @@ class Search:
         :param on_progress: Called about twice a second
         :raises RunFailed: after ten candidates that failed one after the other
         """
-        from sb3_aarl.search.results.dashboard import annotator  # which takes seconds to import
+        from sb3_aarl.search.results.dashboard import annotate_study, annotate_trial  # which take seconds to import
 
+        annotate_study(self.study)
         runs, retries = runs_of(self.config), self.config.retries
-        with annotator(self.study, self.folder) as annotate:
-            driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, annotate)
-            with closing(iter(driver)) as progresses:
-                for progress in progresses:
-                    on_progress(progress)
+        driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, annotate_trial)
+        with closing(iter(driver)) as progresses:
+            for progress in progresses:
+                on_progress(progress)
         return progress
 
 
