@@ -93,7 +93,7 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
     ("arguments", "message"),
     [
         (["cartpole-blance"], "nearest: cartpole-balance"),
-        (["own_env:Own-v0"], "'own_env' as one of the imports"),
+        (["Own-v0"], "Imports (--imports, or imports: in the file) register your own"),
         (["Pendulum-v1", "--aux-loss", "curll"], "nearest: curl"),
         (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "'q_t' is no token"),
         (["Pendulum-v1"], "how many steps"),

@@ -5,11 +5,11 @@ import functools
 import importlib
 import inspect
 import json
+import pydoc
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args
 
 import gymnasium as gym
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError, create_model
@@ -22,6 +22,9 @@ from sb3_aarl.files import ConfigError, read_yaml
 
 # How several environments run, under the names of RL-Zoo's option --vec-env.
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
+
+# A learning rate that falls to 0, as RL-Zoo writes it.
+LINEAR = Annotated[str, Field(pattern=r"^lin_[0-9]*\.?[0-9]+([eE][-+]?[0-9]+)?$")]
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -72,16 +75,10 @@ def env_wrappers(value: Any) -> list[tuple[type[gym.Wrapper], dict[str, Any]]]:
     """
     found = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:
-        name, arguments = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, None)
-        module, _, wrapper = str(name).rpartition(".")
-        try:
-            kind = getattr(importlib.import_module(module), wrapper)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(f"{name!r} cannot be imported: {error}") from None
-        if not (isinstance(kind, type) and issubclass(kind, gym.Wrapper)):
-            raise ValueError(f"{name!r} is no gymnasium.Wrapper")
-        if not isinstance(arguments, Mapping | None):
-            raise ValueError(f"{name} must have a mapping of arguments, not {arguments!r}")
+        ((name, arguments),) = item.items() if isinstance(item, Mapping) and len(item) == 1 else [(item, {})]
+        kind = pydoc.locate(str(name))
+        if not (isinstance(kind, type) and issubclass(kind, gym.Wrapper) and isinstance(arguments, Mapping | None)):
+            raise ValueError(f"must name a gymnasium.Wrapper that can be imported, or map one to its arguments, not {item!r}")
         found.append((kind, dict(arguments or {})))
     return found
 
@@ -124,21 +121,15 @@ def resolve_env_id(name: str) -> str:
     """The id of an environment, registered or the short form of a DeepMind Control task, such as ``Cheetah-Run``."""
     if name in gym.registry:
         return name
-    module, colon, env_id = name.rpartition(":")
-    if colon:  # gym.make would import it, and the processes of the runs would not
-        raise ConfigError(f"unknown environment {name!r}: write {env_id!r}, and {module!r} as one of the imports")
     full = f"{PREFIX}{name.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
     if full in env_ids():
         return full
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
     nearest = ", ".join(difflib.get_close_matches(name, known))
-    hints = [f"The nearest: {nearest}."] if nearest else []
-    is_dmc = name.startswith(PREFIX)
-    if not env_ids() and (is_dmc or "-v" not in name):
-        hints.append(f"{NEEDS_DMC}.")
-    if not is_dmc:
-        hints.append("A module of yours that registers it belongs to the imports (--imports, or imports: in the file)")
-    raise ConfigError(f"unknown environment {name!r}. {' '.join(hints)}")
+    hint = f", nearest: {nearest}" if nearest else ""
+    if not env_ids():
+        hint += f". {NEEDS_DMC}"
+    raise ConfigError(f"unknown environment {name!r}{hint}. Imports (--imports, or imports: in the file) register your own")
 
 
 def import_modules(names: Sequence[str]) -> Sequence[str]:
@@ -176,6 +167,8 @@ def validated(model_class: type[Model], values: Mapping[str, Any], source: str) 
                 problem = _unknown_key(item["loc"], model_class)
             elif item["type"] == "missing":
                 problem = "is missing"
+            elif item["type"] == "needs_python_object":
+                problem = "cannot be set in a file"
             elif problem.startswith("should be"):
                 problem = f"{problem.replace('valid array', 'list').replace('an object', 'a mapping')}, not {item['input']!r}"
             problems.setdefault(_key(values, item["loc"]), []).append(problem)
@@ -205,31 +198,16 @@ def _unknown_key(location: Sequence[str | int], model: Any) -> str:
     return f"unknown key{f', the nearest known is {nearest[0]!r}' if nearest else ''}"
 
 
-def _plain(annotation: Any) -> Any:
-    """The part of an annotation that YAML can express, None if nothing is left."""
-    if annotation == Schedule:
-        return Annotated[str, Field(pattern=r"^lin_[0-9]*\.?[0-9]+([eE][-+]?[0-9]+)?$")]
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin in (Union, UnionType):
-        members = [member for member in map(_plain, arguments) if member is not None]
-        return Union[tuple(members)] if {*members} - {NoneType} else None  # noqa: UP007
-    if origin is Mapping:
-        origin = dict
-    if origin in (tuple, list, dict):
-        return origin[tuple(map(_plain, arguments))]
-    return annotation if annotation in (int, float, str, bool, dict, NoneType, Any, ...) else None
-
-
-def _arguments(function: Callable[..., Any], without: Collection[str]) -> dict[str, Any]:
-    """The arguments of a function that can be plain values, with their types."""
-    kinds = {name: _plain(item.annotation) for name, item in inspect.signature(function).parameters.items()}
-    return {name: kind for name, kind in kinds.items() if kind is not None and name not in without}
-
-
-def _model(name: str, kinds: Mapping[str, Any]) -> Any:
-    """A model without required keys."""
-    fields: Any = {key: (kind, None) for key, kind in kinds.items()}
-    return create_model(name, __config__=ConfigDict(extra="forbid", allow_inf_nan=False), **fields)
+def _model(name: str, function: Callable[..., Any], without: Collection[str], **kinds: Any) -> Any:
+    """The arguments of a function as a model without required keys; ``kinds`` are other types, and other keys."""
+    fields: dict[str, Any] = {key: item.annotation for key, item in inspect.signature(function).parameters.items()} | kinds
+    for key in without:
+        fields.pop(key, None)
+    for key, kind in fields.items():
+        members = tuple(LINEAR if member == Schedule else member for member in get_args(kind))
+        fields[key] = (Union[members] if Schedule in get_args(kind) else kind, None)  # noqa: UP007
+    config = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+    return create_model(name, __config__=config, **fields)
 
 
 def _check_env_wrapper(value: Any) -> Any:
@@ -246,15 +224,18 @@ def _check_aux_loss(value: Any) -> Any:
 @functools.cache
 def _hyperparameters_model(is_dmc: bool) -> type[BaseModel]:
     """The model of an environment's hyper-parameters."""
-    env_kwargs = _arguments(make_dmc_env if is_dmc else wrap_env, without=("env_id", "env", "seed"))
-    kinds = _arguments(SACAux, without=("env", "seed", "_init_setup_model")) | {
-        "policy": Literal[tuple(SACAux.policy_aliases)],
-        "aux_loss": Annotated[str | dict[str, Any] | None, AfterValidator(_check_aux_loss)],
-        "n_timesteps": PositiveInt,
-        "n_envs": PositiveInt,
-        "vec_env": Literal[tuple(VEC_ENVS)],
-        "env_kwargs": _model("EnvKwargs", env_kwargs | {"action_repeat": PositiveInt}) | None,
-        "env_wrapper": Annotated[Any, AfterValidator(_check_env_wrapper)],
-        "normalize": bool | dict[str, Any],
-    }
-    return _model("Hyperparameters", kinds)
+    function = make_dmc_env if is_dmc else wrap_env
+    env_kwargs = _model("EnvKwargs", function, without=("env_id", "env", "seed"), action_repeat=PositiveInt)
+    return _model(
+        "Hyperparameters",
+        SACAux,
+        without=("env", "seed", "_init_setup_model"),
+        policy=Literal[tuple(SACAux.policy_aliases)],
+        aux_loss=Annotated[str | dict[str, Any] | None, AfterValidator(_check_aux_loss)],
+        n_timesteps=PositiveInt,
+        n_envs=PositiveInt,
+        vec_env=Literal[tuple(VEC_ENVS)],
+        env_kwargs=env_kwargs | None,
+        env_wrapper=Annotated[Any, AfterValidator(_check_env_wrapper)],
+        normalize=bool | dict[str, Any],
+    )
