@@ -248,12 +248,11 @@ def leaders(table: pd.DataFrame, top: int = 10) -> pd.DataFrame:
     """The learning curves of the best trials under each metric, for ``learning_curves_plot`` (paper, B.2, figure 10)."""
     ranking = rankings(analysed(table))
     names = {"aulc": "by AULC", "first": "by the first evaluation", "last": "by the last evaluation"}
-    rows = [
-        (name, f"The best {top} candidates", row.number, *point)
-        for metric, name in names.items()
-        for row in ranking.nlargest(top, metric).itertuples()
-        for point in row.curve
-    ]
+    rows = []
+    for metric, name in names.items():
+        best = ranking.nlargest(top, metric)
+        for number, curve in zip(best["number"], best["curve"], strict=True):
+            rows += [(name, f"The best {top} candidates", number, *point) for point in curve]
     return pd.DataFrame(rows, columns=["variant", "env", "seed", "environment_steps", "mean", "std"])
 
 
