@@ -39,7 +39,7 @@ def rate(setting: str, device: str, mode: str, threads: int, seconds: float) -> 
     """One process: gradient steps a second while all others train too."""
     try:
         th.set_num_threads(threads)
-        model = ours(setting, device, **modes("pixels", ["", ", compiled"])[mode])
+        model = ours(setting, device, **modes(setting, ["", ", compiled"])[mode])
         model.set_logger(configure(None, []))
         fill(model, 2000)
         model.train(10 if device == "cuda" else 2, BATCH[setting])

@@ -1,54 +1,51 @@
 """
 What one gradient step costs: SACAux beside SB3's SAC with networks of the same widths and the same batch.
 
-All run in one process and take turns, so that what disturbs the machine disturbs all; ratios are medians of the ratios
-within each round. ``state``: observations and actions of Cheetah-Run, batch 512, two hidden layers of 1024, AARL-State and
-DenseMLP. ``small``: the same with SB3's sizes, batch 256 and two hidden layers of 256, on one thread; ``simba``: with that
-encoder, by default with forward dynamics.
-``pixels``: three stacked frames of 100 x 100 x 3 cropped to 84 x 84, batch 128, AARL-Pixel. SB3's SAC reads pixels of
-84 x 84 through the same encoder class, so that both do the same convolutions. The replay buffers hold random numbers:
-a gradient step costs the same whatever they mean.
+Each row is printed, and written to ``--out``, as soon as it is measured. SB3's SAC takes turns with it, so that what disturbs
+the machine disturbs both; the ratio is the median of the rounds' ratios. ``small``: observations and actions of Cheetah-Run,
+SB3's sizes, batch 256 and two hidden layers of 256, on one thread; ``state``: the paper's, batch 512 and layers of 1024. Both
+have AARL-State and DenseMLP; ``simba`` is SACAux's own encoder, with forward dynamics. ``pixels``: three stacked frames of
+100 x 100 x 3 cropped to 84 x 84, batch 128 (``pixels-512``: 512), AARL-Pixel. SB3's SAC reads pixels of 84 x 84 through the
+same encoder class, so that both do the same convolutions. The replay buffers hold random numbers: a gradient step costs the
+same whatever they mean.
 
-The peak of matrix products is measured in the same process, and every step as a share of it: the floating point operations
-of all matrix products and convolutions, as PyTorch counts them, over what the peak would have done in that time.
-
-The public reference implementation took 107 ms (state) and 1139 ms (pixels) in float32 where matrix products peaked at 220
-GFLOP/s. The last column compares with that, scaled by the float32 peak of this run: ms / (reference x 220 / peak).
+The public reference implementation took 107 ms (state) and 1139 ms (pixels) on a CPU where float32 matrix products peaked at
+220 GFLOP/s. On a CPU the last column compares with that, scaled by the peak of this run: ms / (reference x 220 / peak).
 """
 
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from rich.console import Console
-from rich.table import Table
 from saving import save_result
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils import _pytree as pytree
 
 from sb3_aarl import SACAux
 from sb3_aarl.encoders import PixelEncoder
+from sb3_aarl.sac_aux import COMPILED
 
-torch_compile = th.compile
 ACTION_DIM = 6
 STATE_DIM = 17
 EPISODE = 250
-BATCH = {"state": 512, "small": 256, "pixels": 128, "pixels-512": 512}
-WIDTH = {"state": 1024, "small": 256, "pixels": 1024, "pixels-512": 1024}
-STEPS = {"state": 6, "small": 40, "pixels": 2, "pixels-512": 1}
+BATCH = {"small": 256, "state": 512, "pixels": 128, "pixels-512": 512}
+WIDTH = {"small": 256, "state": 1024, "pixels": 1024, "pixels-512": 1024}
+TRANSITIONS = {"small": 20_000, "state": 20_000, "pixels": 2000, "pixels-512": 2000}
 REFERENCE_MS, REFERENCE_GFLOPS = {"state": 107, "pixels": 1139}, 220
-TRANSITIONS = {"state": 20_000, "small": 20_000, "pixels": 2000, "pixels-512": 2000}
-# How the losses of a row whose name ends so are compiled; SACAux's own way is the first.
-COMPILED: dict[str, dict[str, Any]] = {", compiled": {}, ", CUDA graphs": {"triton.cudagraphs": True}}
+WAYS = ["", ", compiled", ", CUDA graphs"]
+BASE, GRAPHS = "SB3 SAC", WAYS[-1]
 DENSE_MLP: dict[str, Any] = {"policy_kwargs": {"features_extractor_class": "dense_mlp"}}
 PARTS = ("sampling", "critic", "actor", "auxiliary", "targets")
 
@@ -117,22 +114,41 @@ def ours(setting: str, device: str, **kwargs: Any) -> SACAux:
     )
 
 
-def modes(setting: str, compiled: list[str]) -> dict[str, dict[str, Any]]:
-    """The ways to run a gradient step, by name; ``compiled``: endings of ``COMPILED``, and ``""`` for those that are not."""
+def modes(setting: str, ways: list[str]) -> dict[str, dict[str, Any]]:
+    """SACAux's arguments for each row of a setting, by the row's name, which ends with one of ``WAYS``."""
     encoder, loss = ({}, "aarl-pixel") if setting.startswith("pixels") else (DENSE_MLP, "aarl-state")
-    ways: dict[str, dict[str, Any]] = {}
-    for ending in compiled:
+    rows: dict[str, dict[str, Any]] = {}
+    for way in ways:
         for precision in ("fp32", "bf16"):
-            kwargs = {"precision": precision, "compile": bool(ending)}
-            ways[f"{precision}{ending}"] = {**kwargs, **encoder, "aux_loss": loss}
+            kwargs = {"precision": precision, "compile": way == ", compiled"}
+            rows[f"{precision}{way}"] = {**kwargs, **encoder, "aux_loss": loss}
             if setting == "small":
-                ways[f"simba, {precision}{ending}"] = kwargs
-                ways[f"simba, n_steps=3, {precision}{ending}"] = {**kwargs, "n_steps": 3}
-    if "" in compiled:
-        ways["no auxiliary loss"] = {**encoder, "aux_loss": None}
+                rows[f"simba, {precision}{way}"] = kwargs
+                rows[f"simba, n_steps=3, {precision}{way}"] = {**kwargs, "n_steps": 3}
+    if "" in ways:
+        rows["no auxiliary loss"] = {**encoder, "aux_loss": None}
         if setting == "small":
-            ways |= {"simba, no auxiliary loss": {"aux_loss": None}, "simba, AARL-State": {"aux_loss": "aarl-state"}}
-    return ways
+            rows |= {"simba, no auxiliary loss": {"aux_loss": None}, "simba, AARL-State": {"aux_loss": "aarl-state"}}
+    return rows
+
+
+def use_cuda_graphs(model: SACAux) -> None:
+    """
+    Compile a model's losses with CUDA graphs, which overwrite what they returned when they run again: it is copied, and each
+    gradient step says that it begins, so that no graph overwrites what a backward pass of the same step needs.
+    """
+
+    def compiled(function: Callable) -> Callable:
+        function = th.compile(function, options={"fallback_random": True, "triton.cudagraphs": True})
+        return lambda *args: pytree.tree_map_only(th.Tensor, th.clone, function(*args))
+
+    def sample(*args: Any) -> Any:
+        th.compiler.cudagraph_mark_step_begin()
+        return original(*args)
+
+    original = model._sample
+    for name, method in {**{name: compiled(getattr(model, name)) for name in COMPILED}, "_sample": sample}.items():
+        setattr(model, name, method)
 
 
 def synchronize(device: str) -> None:
@@ -140,28 +156,17 @@ def synchronize(device: str) -> None:
         th.cuda.synchronize()
 
 
-def peak(device: str, dtype: th.dtype, setting: str) -> float:
-    """
-    Floating point operations a second of the product that dominates a step: (batch, width) x (width, width). On a GPU, where
-    Python would take longer than that, of a large one.
-    """
-    batch, width, n = (8192, 8192, 20) if device == "cuda" else (BATCH[setting], WIDTH[setting], 5)
-    one, other = th.randn(batch, width, device=device).to(dtype), th.randn(width, width, device=device).to(dtype)
+def peak(setting: str) -> float:
+    """Float32 GFLOP/s of the product that dominates a step: (batch, width) x (width, width)."""
+    batch, width = BATCH[setting], WIDTH[setting]
+    one, other = th.randn(batch, width), th.randn(width, width)
     seconds = []
     for _ in range(10):
         started = time.perf_counter()
-        for _ in range(n):
+        for _ in range(5):
             one @ other
-        synchronize(device)
-        seconds.append((time.perf_counter() - started) / n)
-    return 2 * batch * width * width / min(seconds)
-
-
-def flops(model: SAC, steps: int = 4) -> float:
-    """Floating point operations of matrix products and convolutions in one gradient step, the mean of some."""
-    with FlopCounterMode(display=False) as counter:
-        model.train(steps, model.batch_size)
-    return counter.get_total_flops() / steps
+        seconds.append((time.perf_counter() - started) / 5)
+    return 2e-9 * batch * width * width / min(seconds)
 
 
 def parts(model: SACAux, device: str, steps: int) -> dict[str, float]:
@@ -187,8 +192,8 @@ def parts(model: SACAux, device: str, steps: int) -> dict[str, float]:
     optimizers: dict[str, list[th.optim.Optimizer | None]] = {
         "critic": [model.critic.optimizer],
         "actor": [model.actor.optimizer, model.ent_coef_optimizer],
+        "auxiliary": [model.aux_optimizer],
     }
-    optimizers["auxiliary"] = [model.aux_optimizer]
     hooks = [
         optimizer.register_step_post_hook(lambda *_, part=part: ends(part))
         for part, some in optimizers.items()
@@ -196,121 +201,147 @@ def parts(model: SACAux, device: str, steps: int) -> dict[str, float]:
         if optimizer is not None
     ]
     methods = {"_sample": "sampling", "_update_target": "targets"}
+    originals = {name: getattr(model, name) for name in methods}
     for name, part in methods.items():
-        setattr(model, name, timed(getattr(model, name), part))
+        setattr(model, name, timed(originals[name], part))
     synchronize(device)
     last = time.perf_counter()
     model.train(steps, model.batch_size)
     for hook in hooks:
         hook.remove()
-    for name in methods:
-        delattr(model, name)
+    for name, method in originals.items():
+        setattr(model, name, method)
     return {part: 1e3 * value / steps for part, value in seconds.items()}
 
 
-def compiling(name: str) -> Any:
-    """While a model is made: SACAux compiles its losses as the name of its row says."""
-    options = next((options for ending, options in COMPILED.items() if name.endswith(ending)), {})
+def waits(model: SACAux) -> dict[str, int]:
+    """How often two gradient steps wait for the GPU, by line of code."""
+    th.cuda.set_sync_debug_mode("warn")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.train(2, model.batch_size)
+    th.cuda.set_sync_debug_mode("default")
+    found = [warning for warning in caught if "synchronizing" in str(warning.message)]
+    return dict(Counter(f"{Path(warning.filename).name}:{warning.lineno}" for warning in found))
 
-    def compile_losses(function: Callable, **_: Any) -> Callable:
-        return torch_compile(function, options={"fallback_random": True, **options})
 
-    return mock.patch.object(th, "compile", compile_losses)
+class Measured:
+    """A model that has made its first gradient steps, in which it allocates and compiles."""
+
+    def __init__(self, model: SAC, device: str, buffers: dict[Any, ReplayBuffer | None], seconds: float):
+        self.model, self.device = model, device
+        kind = type(model), model.n_steps
+        if kind not in buffers:
+            fill(model, model.buffer_size)
+            buffers[kind] = model.replay_buffer
+        model.replay_buffer = buffers[kind]
+        model.set_logger(configure(None, []))
+        before = th.cuda.memory_allocated() if device == "cuda" else 0
+        if device == "cuda":
+            th.cuda.reset_peak_memory_stats()
+        started = time.perf_counter()
+        model.train(8, model.batch_size)
+        synchronize(device)
+        self.first_seconds = time.perf_counter() - started
+        self.memory_mb = (th.cuda.max_memory_allocated() - before) / 1e6 if device == "cuda" else None
+        self.steps = 4
+        self.steps = max(2, round(seconds / self.seconds()))
+
+    def seconds(self) -> float:
+        """Of a gradient step, the mean of some; each in a call of train(), as in learn()."""
+        synchronize(self.device)
+        started = time.perf_counter()
+        for _ in range(self.steps):
+            self.model.train(1, self.model.batch_size)
+        synchronize(self.device)
+        return (time.perf_counter() - started) / self.steps
 
 
 def measure(
-    setting: str, device: str, variants: dict[str, dict[str, Any]], rounds: int, steps: int, at_once: int = 1
-) -> list[dict[str, Any]]:
-    models: dict[str, SAC] = {}
-    memory: dict[str, float] = {}
-    for name in ("SB3 SAC", *variants):
-        before = th.cuda.memory_allocated() if device == "cuda" else 0
-        with compiling(name):
-            model = models[name] = sb3(setting, device) if name == "SB3 SAC" else ours(setting, device, **variants[name])
-        model.set_logger(configure(None, []))
-        # On a GPU time is short, and no cache of a processor plays a part.
-        fill(model, TRANSITIONS[setting] // (5 if device == "cuda" else 1))
-        if device == "cuda":
-            th.cuda.reset_peak_memory_stats()
-        model.train(8, model.batch_size)  # allocates, warms up, compiles
-        if device == "cuda":
-            memory[name] = (th.cuda.max_memory_allocated() - before) / 1e6
-    seconds: dict[str, list[float]] = {name: [] for name in models}
-    for _ in range(rounds):
-        for name, model in models.items():
-            synchronize(device)
-            started = time.perf_counter()
-            calls = max(1, steps // at_once)
-            for _ in range(calls):
-                model.train(at_once, model.batch_size)
-            synchronize(device)
-            seconds[name].append((time.perf_counter() - started) / (calls * at_once))
-    rows = []
-    for name, model in models.items():
-        bf16 = getattr(model, "precision", "fp32") == "bf16"
-        row: dict[str, Any] = {
-            "setting": setting,
-            "algorithm": name,
-            "ms": 1e3 * statistics.median(seconds[name]),
-            "steps_per_second": 1 / statistics.median(seconds[name]),
-            "memory_mb": memory.get(name),
-            "ratio": statistics.median(own / base for own, base in zip(seconds[name], seconds["SB3 SAC"], strict=True)),
-            "rounds_ms": [1e3 * value for value in seconds[name]],
-            "gflop": flops(model) / 1e9,
-            "peak_gflops": peak(device, th.bfloat16 if bf16 else th.float32, setting) / 1e9,
-        }
-        row["share_of_peak"] = row["gflop"] / row["peak_gflops"] / (row["ms"] / 1e3)
-        if isinstance(model, SACAux):
-            row["parts_ms"] = parts(model, device, 2 * steps)
-        rows.append(row)
-    float32_peak = max(row["peak_gflops"] for row in rows if "bf16" not in row["algorithm"])
-    for row in rows if device == "cpu" and setting in REFERENCE_MS else []:
-        row["ratio_to_reference"] = row["ms"] / (REFERENCE_MS[setting] * REFERENCE_GFLOPS / float32_peak)
-    return rows
+    setting: str, device: str, rows: dict[str, dict[str, Any]], rounds: int, seconds: float
+) -> Iterator[dict[str, Any]]:
+    """SB3's SAC and each row, as soon as it is measured; a row that fails has the reason."""
+    buffers: dict[Any, ReplayBuffer | None] = {}
+    base = Measured(sb3(setting, device), device, buffers, seconds)
+    compared = device == "cpu" and setting in REFERENCE_MS
+    reference = REFERENCE_MS[setting] * REFERENCE_GFLOPS / peak(setting) if compared else None
+    for name, kwargs in {BASE: {}, **rows}.items():
+        row: dict[str, Any] = {"setting": setting, "algorithm": name}
+        try:
+            if name == BASE:
+                measured = base
+            else:
+                th.compiler.reset()  # another model is no reason to compile a function again
+                model = ours(setting, device, **kwargs)
+                if name.endswith(GRAPHS):
+                    use_cuda_graphs(model)
+                measured = Measured(model, device, buffers, seconds)
+            pairs = [(base.seconds(), measured.seconds()) for _ in range(rounds)]
+            row["ms"] = 1e3 * statistics.median(own for _, own in pairs)
+            row["steps_per_second"] = 1e3 / row["ms"]
+            row["ratio"] = statistics.median(own / theirs for theirs, own in pairs)
+            row["rounds_ms"] = [1e3 * own for _, own in pairs]
+            row["sb3_rounds_ms"] = [1e3 * theirs for theirs, _ in pairs]
+            row["memory_mb"], row["first_seconds"] = measured.memory_mb, measured.first_seconds
+            if reference is not None:
+                row["ratio_to_reference"] = row["ms"] / reference
+            if isinstance(measured.model, SACAux):
+                row["parts_ms"] = parts(measured.model, device, 2 * measured.steps)
+                if device == "cuda":
+                    row["waits"] = waits(measured.model)
+        except Exception as error:  # the other rows are worth having
+            traceback.print_exc()
+            row["error"] = f"{type(error).__name__}: {error}".partition("\n")[0]
+        yield row
 
 
-def show(rows: list[dict[str, Any]]) -> None:
-    columns = ["setting", "algorithm", "ms", "ratio", "GFLOP", "of peak", *PARTS, "reference"]
-    table = Table(
-        *columns, title="One gradient step (median; ratio to SB3's SAC; parts in ms; ratio to the reference, scaled)"
-    )
-    for row in rows:
-        split = row.get("parts_ms", {})
-        table.add_row(
-            row["setting"],
-            row["algorithm"],
-            f"{row['ms']:.1f}" if row["ms"] >= 10 else f"{row['ms']:.3f}",
-            f"{row['ratio']:.3f}",
-            f"{row['gflop']:.1f}",
-            f"{row['share_of_peak']:.0%}",
-            *(f"{split[part]:.2f}" if split else "" for part in PARTS),
-            f"{row['ratio_to_reference']:.3f}" if "ratio_to_reference" in row else "",
-        )
-    Console(width=160).print(table)
+def line(row: dict[str, Any]) -> str:
+    """A row of the table that is printed."""
+    start = f"{row['setting']:10} {row['algorithm']:32}"
+    if "ms" not in row:
+        return f"{start} {row.get('error') or row['skipped']}"
+    memory = f"{row['memory_mb']:8.0f}" if row["memory_mb"] is not None else " " * 8
+    split = row.get("parts_ms")
+    shares = " ".join(f"{split[part]:10.2f}" for part in PARTS) if split else " " * 54
+    reference = f"{row['ratio_to_reference']:9.3f}" if "ratio_to_reference" in row else ""
+    measured = f"{row['steps_per_second']:8.1f} {row['ms']:8.2f} {row['ratio']:6.3f} {memory} {row['first_seconds']:6.1f}"
+    return f"{start} {measured} {shares} {reference} {row.get('error', '')}".rstrip()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--settings", nargs="+", default=list(BATCH), choices=list(BATCH))
     parser.add_argument("--device", default="cuda" if th.cuda.is_available() else "cpu", choices=["cpu", "cuda"])
+    names = list(modes("small", WAYS))
+    parser.add_argument("--rows", nargs="+", choices=names, help="SB3's SAC is always there. Default: all")
+    parser.add_argument("--batch-size", type=int, help="another than the settings'")
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--steps", type=int, help="gradient steps of each algorithm in a round")
-    parser.add_argument(
-        "--at-once", type=int, default=1, help="gradient steps in a call of train(); learn() makes one in each"
-    )
-    ways = {"no": [""], "all": ["", ", compiled"], "only": [", compiled"], "graphs": [", CUDA graphs"]}
-    parser.add_argument("--compiled", choices=list(ways), default="all", help="by SACAux, or with CUDA graphs too")
+    parser.add_argument("--seconds", type=float, default=0.5, help="of a round, for each of the two")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
+    BATCH.update(dict.fromkeys(BATCH, args.batch_size) if args.batch_size else {})
+    titles = " ".join(f"{part:>10}" for part in PARTS)
+    print(f"{'setting':10} {'algorithm':32}  steps/s       ms  ratio  peak MB  first {titles} reference", flush=True)
     rows, threads = [], th.get_num_threads()
+
+    def done(row: dict[str, Any]) -> None:
+        rows.append(row)
+        print(line(row), flush=True)
+        if args.out:  # what comes later may be cut off
+            save_result(args.out, threads=threads, rows=rows)
+
     for setting in args.settings:
         th.set_num_threads(1 if setting == "small" else threads)
-        steps = args.steps or (200 if args.device == "cuda" else STEPS[setting])
-        rows += measure(setting, args.device, modes(setting, ways[args.compiled]), args.rounds, steps, args.at_once)
-        show(rows)
-        if args.out:  # after each setting: what comes later may be cut off
-            save_result(args.out, threads=threads, rows=rows)
+        chosen = {name: kwargs for name, kwargs in modes(setting, WAYS).items() if name in (args.rows or names)}
+        if args.rows:
+            chosen = {name: chosen[name] for name in args.rows if name in chosen}
+        skipped = [name for name in chosen if args.device == "cpu" and name.endswith(GRAPHS)]
+        for name in skipped:
+            done({"setting": setting, "algorithm": name, "skipped": "needs a GPU"})
+        chosen = {name: kwargs for name, kwargs in chosen.items() if name not in skipped}
+        for row in measure(setting, args.device, chosen, args.rounds, args.seconds):
+            done(row)
 
 
 if __name__ == "__main__":
