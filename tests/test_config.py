@@ -273,10 +273,23 @@ def test_short_names_of_environments() -> None:
 
 # What is refused.
 
+PENDULUM = {"environment": "Pendulum-v1", "returns": [-1500, -100]}
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"populaton_size": 3}, "populaton_size: unknown key, .*'population_size'"),
     ({"cross_validation": {"environments": ["Pendulum-v1"], "sedes": [1]}}, "cross_validation.sedes: .*'seeds'"),
-    ({"cross_validation": {}}, "cross_validation.environments: is missing"),
+    ({"environments": [PENDULUM]}, "environment: environments is there too"),
+    ({"environment": None, "environments": [{"environment": "Pendulum-v1"}]}, r"environments\[0\].returns: is missing"),
+    ({"environment": None, "environments": [PENDULUM | {"returns": [3, 3]}]}, r"environments\[0\].returns: must be .*not \[3"),
+    ({"environment": None, "environments": [PENDULUM, PENDULUM]}, "environments: .*none twice.*Pendulum-v1"),
+    ({"environment": None, "environments": [PENDULUM | {"overrides": {"gama": 1}}]}, "Pendulum-v1: overrides: gama: unknown"),
+    (
+        {"environment": None, "environments": [PENDULUM], "cross_validation": {"environments": ["walker-run"]}},
+        "cross_validation.returns: dm_control/walker-run-v0 is missing",
+    ),
+    ({"space": {"gamma": {"type": "float", "low": 0.9}}}, "space.gamma: must be a list of choices, or {type: .*not {"),
+    ({"space": {"gamma": {"type": "float", "low": 0.9, "high": 0.8}}}, "space.gamma: .*low"),
+    ({"space": {"gama": [0.9]}}, "space.gama: gama: unknown key, .*'gamma'"),
+    ({"space": {"batch_size": [8, 0.5]}}, "space.batch_size: batch_size: should be a valid integer"),
     ({"baselines": [{"name": "a", "aux_los": None}]}, r"baselines\[0\].aux_los: .*'aux_loss'"),
     ({"baselines": [{"name": "a", "aux_loss": "curll"}]}, r"baselines\[0\].aux_loss: .*nearest: curl"),
     (

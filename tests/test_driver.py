@@ -32,13 +32,17 @@ SETTINGS: dict[str, Any] = {"population_size": 6, "n_random": 5, "n_prior": 2, "
 
 def returns(run: Run) -> list[float]:
     """What a run of these tests reaches: a function of its loss and seed."""
-    rng = random.Random(f"{AuxLoss.parse(str(run.aux_loss)).canonical()} {run.seed}")
+    rng = random.Random(f"{AuxLoss.parse(str(run.aux_loss)).canonical()} {run.environment} {run.seed}")
     return [rng.uniform(0, 100) for _ in run.checkpoints]
 
 
-def make_runs(loss: AuxLoss, seeds: tuple[int, ...] = (0, 1)) -> list[Run]:
-    values: dict[str, Any] = {"environment": "Pendulum-v1", "hyperparameters": {}, "checkpoints": CHECKPOINTS}
-    return [Run(aux_loss=str(loss), seed=seed, **values) for seed in seeds]
+# Environments, and their returns that count as 0 and 1.
+TASKS = {"Pendulum-v1": (-50.0, 150.0), "MountainCarContinuous-v0": (40.0, 80.0)}
+
+
+def make_runs(loss: AuxLoss, environments: Any = ("Pendulum-v1",), seeds: tuple[int, ...] = (0, 1)) -> list[Run]:
+    values: dict[str, Any] = {"aux_loss": str(loss), "hyperparameters": {}, "checkpoints": CHECKPOINTS}
+    return [Run(environment=environment, seed=seed, **values) for environment in environments for seed in seeds]
 
 
 class Executor:
@@ -76,7 +80,7 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 STORAGES: dict[Path, BaseStorage] = {}
 
 
-def start(folder: Path, executor: Executor, workers: int = 1, **kwargs: Any) -> Driver:
+def start(folder: Path, executor: Executor, workers: int = 1, environments: Any = ("Pendulum-v1",), **kwargs: Any) -> Driver:
     """The driver of a folder's study, as the command line makes it: a new sampler each time."""
     storage = STORAGES.setdefault(folder, InMemoryStorage())
     study = optuna.create_study(
@@ -87,7 +91,9 @@ def start(folder: Path, executor: Executor, workers: int = 1, **kwargs: Any) -> 
         load_if_exists=True,
         pruner=kwargs.pop("pruner", optuna.pruners.NopPruner()),
     )
-    return Driver(study, storage, kwargs.pop("make_runs", make_runs), executor, folder, workers, **kwargs)
+    return Driver(
+        study, storage, lambda trial: make_runs(suggest_aux_loss(trial), environments), executor, folder, workers, **kwargs
+    )
 
 
 def outcome(search: Driver) -> dict[tuple[int, int], tuple[str, float | None]]:
@@ -100,16 +106,19 @@ def outcome(search: Driver) -> dict[tuple[int, int], tuple[str, float | None]]:
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], tuple[str, float | None]]:
-    """One candidate after the other, undisturbed."""
+    """One candidate after the other, undisturbed, on several environments."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "POLL_SECONDS", 0)
         executor, rng = Executor(), random.Random(0)
-        search = start(tmp_path_factory.mktemp("expected"), executor)
+        search = start(tmp_path_factory.mktemp("expected"), executor, 1, TASKS, returns=TASKS)
         for _ in search:
             while executor.pending:
                 executor.end(rng)
     found = outcome(search)
     assert len(found) == 7 + 6 + 6
+    for text, score in found.values():
+        means = [sum(map(sum, map(returns, make_runs(AuxLoss.parse(text), [name])))) / 6 for name in TASKS]
+        assert score == pytest.approx(((means[0] + 50) / 200 + (means[1] - 40) / 40) / 2)
     return found
 
 
@@ -119,7 +128,7 @@ def test_losses_and_scores_depend_on_nothing_but_the_seed(workers: int, tmp_path
     rng = random.Random(workers)
     while True:
         executor = Executor()  # processes end with their driver
-        search = start(tmp_path, executor, workers, retries=100)
+        search = start(tmp_path, executor, workers, TASKS, returns=TASKS, retries=100)
         for progress in search:  # noqa: B007
             assert len(executor.pending) <= workers
             if rng.random() < 0.05:
@@ -263,6 +272,25 @@ def test_reports_the_mean_over_the_seeds_and_prunes(tmp_path: Path) -> None:
             assert trial.value == pytest.approx(sum(means) / 3)
             assert [point[1] for point in trial.user_attrs["curve"]] == pytest.approx(means)
     assert pruned and complete
+
+
+def test_pruners_act_between_environments(tmp_path: Path) -> None:
+    executor, rng = Executor(), random.Random(0)
+    search = start(tmp_path, executor, 2, TASKS, returns=TASKS, pruner=ThresholdPruner(lower=0.5))
+    for _ in search:
+        executor.evaluate()
+        if executor.pending:
+            executor.end(rng)
+    states = {TrialState.PRUNED: 1, TrialState.COMPLETE: 2}
+    assert {trial.state for trial in search.study.trials} == set(states)
+    for trial in search.study.trials:
+        reports = trial.intermediate_values
+        assert list(reports) == list(range(1, states[trial.state] + 1)) and (reports[1] < 0.5) == (len(reports) == 1)
+        tasks = [path.name for path in driver.candidate_folder(tmp_path, trial).iterdir()]
+        assert (
+            sorted(tasks) == sorted([*TASKS][: len(reports)]) and list(trial.user_attrs["scores"]) == [*TASKS][: len(reports)]
+        )
+        assert trial.state == TrialState.PRUNED or trial.value == reports[2]
 
 
 def test_a_run_that_is_told_to_stop_is_not_submitted_again(tmp_path: Path) -> None:

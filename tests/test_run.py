@@ -116,6 +116,10 @@ def test_a_folder_of_another_run_is_refused(changes: dict[str, Any], key: str, t
     with pytest.raises(ValueError, match=f"{tmp_path}/run has another run: {key}"):
         prepare_run(tmp_path / "run", make_run(**changes))
     assert (tmp_path / "run" / "run.json").read_bytes() == before
+    falling = DENSE | {"learning_rate": "lin_1e-3"}  # of a longer run it is another schedule
+    prepare_run(tmp_path / "falling", make_run(hyperparameters=falling))
+    with pytest.raises(ValueError, match="checkpoints is"):
+        prepare_run(tmp_path / "falling", make_run(hyperparameters=falling, checkpoints=(32, 64, 96)))
 
 
 def test_the_device_may_change(tmp_path: Path) -> None:
@@ -167,15 +171,19 @@ def test_the_model_is_kept_and_evaluated_as_documented(tmp_path: Path) -> None:
     assert not is_finished(tmp_path) and read_outcome(tmp_path) is None
 
 
-def test_a_run_that_is_stopped_ends_at_its_next_evaluation(tmp_path: Path) -> None:
+def test_a_run_that_is_stopped_ends_at_once_and_is_promoted_later(tmp_path: Path) -> None:
+    checkpoints = (32, 64, 96)
+    prepare_run(tmp_path / "undisturbed", make_run(checkpoints=checkpoints))
+    expected = train(tmp_path / "undisturbed")
     prepare_run(tmp_path, make_run())
-    (tmp_path / "stop").touch()
-    curve = train(tmp_path)
-    assert [point.environment_steps for point in curve] == [32]
-    assert read_outcome(tmp_path) is None and not (tmp_path / "checkpoint.pt").exists()
-    prepare_run(tmp_path, make_run())
+    curve = train(tmp_path, on_evaluation=lambda curve: (tmp_path / "stop").touch())
+    n_steps = Walk.n_steps
+    assert [point.environment_steps for point in curve] == [32] and read_outcome(tmp_path) is None
+    assert train(tmp_path) == curve and Walk.n_steps <= n_steps + 1  # it is still told to stop
+    prepare_run(tmp_path, make_run(checkpoints=checkpoints))
     whole = train(tmp_path)
-    assert [point.environment_steps for point in whole] == [32, 64] and whole[0].mean == curve[0].mean
+    assert [point[:4] for point in whole] == [point[:4] for point in expected]
+    assert not (tmp_path / "checkpoint.pt").exists()
 
 
 def test_a_candidate_that_fails_is_not_to_be_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

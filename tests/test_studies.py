@@ -12,13 +12,15 @@ from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import InMemoryStorage
 from optuna.trial import create_trial
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
-from sb3_aarl.search.evolution.space import distributions, loss_to_params, random_loss
+from sb3_aarl.search.evolution.space import distributions, loss_of, loss_to_params, random_loss
 from sb3_aarl.search.evolution.surrogate import features
 from sb3_aarl.search.execution.driver import SearchProgress
-from sb3_aarl.search.execution.matrix import Cell
+from sb3_aarl.search.execution.matrix import Cell, run_matrix
+from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.config import SearchConfig, load_config
 from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, runs_of
+from sb3_aarl.search.studies.status import matrix_status
 from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError
 from sklearn.linear_model import BayesianRidge
@@ -140,12 +142,72 @@ def test_a_file_is_read_once_and_its_settings_are_checked_once(
 
 
 def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None:
-    runs = runs_of(config.model_copy(update={"seeds": (4, 9), "imports": ("json",), "threads": 2}))(LOSSES[0])
+    study = optuna.create_study(sampler=AuxLossSampler(**config.sampler_settings()))
+    make_runs = runs_of(config.model_copy(update={"seeds": (4, 9), "imports": ("json",), "threads": 2}))
+    trial = study.ask()
+    runs = make_runs(trial)
     assert [run.seed for run in runs] == [4, 9]
     for run in runs:
-        assert (run.environment, run.aux_loss, run.threads, run.imports) == ("Pendulum-v1", str(LOSSES[0]), 2, ("json",))
-        assert (run.checkpoints, run.evaluation_episodes) == ((200, 400), 1)
+        assert (run.environment, run.aux_loss) == ("Pendulum-v1", str(loss_of(trial)))
+        assert (run.checkpoints, run.evaluation_episodes, run.threads, run.imports) == ((200, 400), 1, 2, ("json",))
         assert run.hyperparameters["policy_kwargs"]["net_arch"] == [8]
+    for index, seeds in ((1, [10, 11]), (2, [12, 13])):  # trained again
+        trial = study.ask()
+        trial.set_user_attr("seed_index", index)
+        assert [run.seed for run in make_runs(trial)] == seeds
+
+
+SEVERAL = """\
+environments:
+- {environment: Pendulum-v1, returns: [0, 2]}
+- environment: MountainCarContinuous-v0
+  returns: [-3, 1]
+  checkpoints: [100, 200]
+  overrides: {gamma: 0.9}
+space:
+  batch_size: [8, 16]
+  learning_rate: {type: float, low: 1e-4, high: 1e-2, log: true}
+baselines:
+- {name: CURL, aux_loss: curl}
+cross_validation: {top: 1}
+"""
+
+
+def test_a_search_on_several_environments_and_of_hyperparameters(tmp_path: Path, executor: Planted) -> None:
+    path = write_search(tmp_path, SEARCH.replace("environment: Pendulum-v1\n", SEVERAL))
+    search = Search.from_file(path, tmp_path / "mine", generations=1)
+    search.run(executor, workers=2)
+    tasks = list(search.config.tasks)
+    for trial in search.study.trials:
+        runs = [run for run in executor.runs if run.aux_loss == trial.user_attrs["loss"]]
+        assert [run.environment for run in runs] == tasks and [run.checkpoints[-1] for run in runs] == [400, 200]
+        for run, gamma in zip(runs, (None, 0.9), strict=True):
+            assert run.hyperparameters.get("gamma") == gamma
+            assert all(run.hyperparameters[name] == trial.params[name] for name in ("batch_size", "learning_rate"))
+        # The AULC is 1 on both: a half, and 1.
+        assert trial.user_attrs["scores"] == dict(zip(tasks, (0.5, 1.0), strict=True)) and trial.value == 0.75
+    assert {trial.params["batch_size"] for trial in search.study.trials} <= {8, 16}
+
+    for changes, message in (
+        ({"overrides": {"gamma": 0.8}}, "environments.Pendulum-v1.gamma=None, not 0.8"),
+        (
+            {"environments": [{"environment": task, "returns": [0, 2]} for task in tasks]},
+            "environments.MountainCar.*returns=.* not",
+        ),
+        ({"space": {}}, "space="),
+    ):
+        with pytest.raises(ValueError, match=f"was started with {message}"):
+            _ = Search(load_config(path, **changes), tmp_path / "mine").study
+
+    matrix = baselines(search.config, tmp_path / "mine")
+    assert list(matrix.runs) == [Cell("CURL", task, 0) for task in tasks]
+    list(run_matrix(matrix, executor))
+    assert stored_baselines(tmp_path / "mine") == [("CURL", 0.75)]
+    table, _ = matrix_status(matrix.folder)
+    assert list(table["score"]) == [0.75]
+    validation = cross_validation.make_matrix(search.config, search.study, tmp_path / "mine")
+    assert [cell[1:] for cell in validation.runs] == [(task, seed) for seed in (0, 1, 2) for task in tasks]
+    assert [run.checkpoints[-1] for run in validation.runs.values()] == [400, 200] * 3
 
 
 def test_pruners(config: SearchConfig) -> None:

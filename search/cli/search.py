@@ -101,9 +101,13 @@ def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
     from sb3_aarl.search.studies import cross_validation
     from sb3_aarl.search.studies.search import all_runs, baselines
 
-    kinds = {config.name: all_runs(config)}
+    kinds: dict[str, list[Run]] = {}
+    for run in all_runs(config):
+        task = f": {task_name(run.environment)}" if len(config.tasks) > 1 else ""
+        kinds.setdefault(config.name + task, []).append(run)
     for cell, run in baselines(config, Path()).runs.items():
-        kinds.setdefault(f"baselines: {cell.variant}", []).append(run)
+        task = f", {task_name(run.environment)}" if len(config.tasks) > 1 else ""
+        kinds.setdefault(f"baselines: {cell.variant}{task}", []).append(run)
     names = {baseline.name for baseline in config.baselines}
     for cell, run in cross_validation.all_runs(config).items() if config.cross_validation else ():
         baseline = f", {cell.variant}" if cell.variant in names else ""

@@ -4,8 +4,9 @@ import logging
 import math
 import time
 import traceback
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,15 +15,15 @@ import optuna
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
-from sb3_aarl.search.evolution.space import loss_of, suggest_aux_loss
+from sb3_aarl.search.evolution.space import loss_of
 from sb3_aarl.search.execution.executors import Executor
+from sb3_aarl.search.execution.matrix import scaled, task_folder
 from sb3_aarl.search.execution.queue import Job, Queue, seconds_to_go
 from sb3_aarl.search.execution.storage import cause, driver_lock, is_temporary
 from sb3_aarl.search.training.folder import Run, partial_curve
 from sb3_aarl.search.training.provenance import commit, read_about, versions
 from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
-from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.callbacks import Evaluation, aulc
 
 logger = logging.getLogger(__name__)
@@ -54,14 +55,19 @@ class SearchProgress(NamedTuple):
 
 @dataclass
 class RunningTrial:
-    """A trial, its runs in the queue (one for each seed), and the number of evaluations reported to Optuna."""
+    """
+    A trial, its runs on the environments that are not reached yet, its jobs on those that are done and on the one that is
+    trained on (one for each seed), and the number of evaluations reported to Optuna.
+    """
 
     trial: optuna.Trial
-    jobs: list[Job]
+    waiting: list[list[Run]]
+    done: list[list[Job]] = field(default_factory=list)
+    jobs: list[Job] = field(default_factory=list)
     n_reported: int = 0
 
     def stop(self) -> None:
-        """End its runs at their next evaluations."""
+        """End its runs."""
         for job in self.jobs:
             job.stop()
 
@@ -73,22 +79,24 @@ class Driver:
 
     :param study: A study with an ``AuxLossSampler``, to be maximized or minimized
     :param storage: Its storage
-    :param make_runs: The runs of a candidate, one for each seed
+    :param make_runs: The runs of a trial, of which it suggests the loss: on each environment, one for each seed
     :param executor: Where runs are executed
     :param folder: Folder of the search
     :param workers: Runs that are at the executor at the same time
     :param retries: How often a run is resubmitted
     :param on_change: Called with a trial when it starts, when it is reported, and before it is told
+    :param returns: The returns that count as 0 and 1 on each environment, None where they count as they are
     """
 
     study: optuna.Study
     storage: BaseStorage
-    make_runs: Callable[[AuxLoss], Sequence[Run]]
+    make_runs: Callable[[optuna.Trial], Sequence[Run]]
     executor: Executor
     folder: Path
     workers: int = 1
     retries: int = 3
     on_change: Callable[[optuna.Trial], None] = lambda trial: None
+    returns: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.study.sampler, AuxLossSampler):
@@ -145,52 +153,86 @@ class Driver:
                 self.study.tell(trial.number, state=TrialState.FAIL)
 
     def _start(self, trial: optuna.Trial) -> None:
-        """Submit a candidate's runs."""
+        """Submit a candidate's runs on its first environment."""
         try:
-            loss = self._patiently(suggest_aux_loss, trial)
+            runs = self._patiently(self.make_runs, trial)
         except optuna.TrialPruned as problem:  # enqueued by the user, and not valid
             logger.warning("Trial %d: %s", trial.number, problem)
             self._tell(trial, state=TrialState.PRUNED)
             return
-        runs = self.make_runs(loss)
         attributes = {
-            "loss": str(loss),
+            "loss": runs[0].aux_loss,
             "commit": commit(),
             "versions": versions(),
             "threads": runs[0].threads,
         }
         self._note(trial, attributes)
-        folder = candidate_folder(self.folder, trial)
-        jobs = [self.queue.add(folder / f"seed-{run.seed}", run) for run in runs]
-        self.running[trial.number] = RunningTrial(trial, jobs)
-        self.queue.update()
+        tasks = [list(task) for _, task in groupby(runs, lambda run: run.environment)]
+        self.running[trial.number] = RunningTrial(trial, tasks)
+        self._submit(self.running[trial.number])
         self._patiently(self.on_change, trial)
 
+    def _submit(self, running: RunningTrial) -> None:
+        """Submit a candidate's runs on its next environment."""
+        folder = candidate_folder(self.folder, running.trial)
+        if len(running.waiting) + len(running.done) > 1:
+            folder /= task_folder(running.waiting[0][0].environment)
+        running.jobs = [self.queue.add(folder / f"seed-{run.seed}", run) for run in running.waiting.pop(0)]
+        self.queue.update()
+
     def _check(self, running: RunningTrial) -> None:
-        """Report the evaluations of a candidate, and its result when all of its runs are over."""
+        """Report the evaluations of a candidate, submit its runs on the next environment, and tell its result."""
         trial, jobs = running.trial, running.jobs
         is_over = all(job.is_over for job in jobs)
-        curves = [job.curve if is_over else partial_curve(job.folder) for job in jobs]
-        self._report(running, mean_curve(curves))
+        curve = mean_curve(self._curves(jobs))
+        if not running.waiting and not running.done:
+            self._report(running, curve)
         failure = next((job.failure for job in jobs if job.failure is not None), None)
-        if failure is not None and not is_over:
-            running.stop()
         if not is_over:
+            if failure is not None:
+                running.stop()
             return
-        session = read_about(jobs[0].folder).get("sessions", [{}])[-1]
-        device = f"GPU: {session['gpu']}" if "cuda" in session.get("device", "") else f"CPU: {session.get('cpu')}"
-        seconds = round(sum(curve[-1].seconds for curve in curves if curve), 1)
-        self._note(trial, {"curve": mean_curve(curves), "seconds": seconds, "device": device})
-        checkpoints = jobs[0].run.checkpoints
+        running.done.append(jobs)
         if failure is None:
-            failure = next((f"its mean return is {mean}" for _, mean in mean_curve(curves) if not math.isfinite(mean)), None)
+            failure = next((f"its mean return is {mean}" for _, mean in curve if not math.isfinite(mean)), None)
+        is_whole = failure is None and all(len(job.curve) == len(job.run.checkpoints) for job in jobs)
+        if is_whole:
+            of_tasks = [float(np.mean([aulc(curve) for curve in self._curves(task)])) for task in running.done]
+            score = float(np.mean(of_tasks))
+            if running.waiting or len(of_tasks) > 1:
+                names = [task[0].run.environment for task in running.done]
+                self._note(trial, {"scores": dict(zip(names, of_tasks, strict=True))})
+                self._patiently(trial.report, score, len(of_tasks))
+            if running.waiting and not self._patiently(trial.should_prune):
+                self._patiently(self.on_change, trial)
+                self._submit(running)
+                return
+            is_whole = not running.waiting
+        self._note_runs(trial, [job for task in running.done for job in task])
         if failure is not None:
             self._fail(trial, failure)
-        elif any(len(curve) < len(checkpoints) for curve in curves):
+        elif not is_whole:
             self._tell(trial, state=TrialState.PRUNED)
         else:
             self.n_failures = 0
-            self._tell(trial, values=float(np.mean([aulc(curve) for curve in curves])))
+            self._tell(trial, values=score)
+
+    def _curves(self, jobs: Sequence[Job]) -> list[list[Evaluation]]:
+        """The curves of jobs so far, on the scale of their environments' returns."""
+        found = []
+        for job in jobs:
+            returns, curve = self.returns.get(job.run.environment), job.curve if job.is_over else partial_curve(job.folder)
+            found.append([point._replace(mean=scaled(point.mean, returns)) for point in curve])
+        return found
+
+    def _note_runs(self, trial: optuna.Trial, jobs: Sequence[Job]) -> None:
+        """Note the mean curve, if all environments have the same checkpoints, and how long the runs took on which machine."""
+        session = read_about(jobs[0].folder).get("sessions", [{}])[-1]
+        device = f"GPU: {session['gpu']}" if "cuda" in session.get("device", "") else f"CPU: {session.get('cpu')}"
+        seconds = round(sum(job.curve[-1].seconds for job in jobs if job.curve), 1)
+        is_alike = len({job.run.checkpoints for job in jobs}) == 1
+        curve = mean_curve(self._curves(jobs)) if is_alike else []
+        self._note(trial, {"curve": curve, "seconds": seconds, "device": device})
 
     def _report(self, running: RunningTrial, curve: list[list[float]]) -> None:
         """Report the mean over the seeds of each step that all of them have evaluated."""

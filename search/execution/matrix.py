@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -58,13 +58,23 @@ def task_name(environment: str) -> str:
     return environment.removeprefix(PREFIX).removesuffix("-v0") if environment.startswith(PREFIX) else environment
 
 
+def task_folder(environment: str) -> str:
+    """The name of an environment's folder."""
+    return task_name(environment).replace("/", "_")
+
+
+def scaled(score: float, returns: Sequence[float] | None) -> float:
+    """A return or AULC on the scale on which the first of two returns is 0 and the second one 1; without them as it is."""
+    return score if returns is None else (score - returns[0]) / (returns[1] - returns[0])
+
+
 def cell_folder(folder: Path, cell: Cell) -> Path:
     """Where a run is: ``FOLDER/VARIANT/TASK/seed-N``."""
     variant = cell.variant
     if not re.fullmatch(r"[\w.-]{1,80}", variant):  # such as a loss's notation
         slug = re.sub(r"[^a-z0-9]+", "-", variant.lower()).strip("-")[:60]
         variant = f"{slug}-{hashlib.sha256(variant.encode()).hexdigest()[:8]}"
-    return folder / variant / task_name(cell.environment).replace("/", "_") / f"seed-{cell.seed}"
+    return folder / variant / task_folder(cell.environment) / f"seed-{cell.seed}"
 
 
 def check_matrix(matrix: Matrix, source: str = "") -> None:
@@ -127,8 +137,8 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
 
 def scores(matrix: Matrix) -> pd.DataFrame:
     """
-    The finished runs: one row each with ``variant``, ``environment``, ``seed``, ``score`` (AULC) and ``last`` (mean return at
-    the last checkpoint).
+    The finished runs: one row each with ``variant``, ``environment``, ``seed``, ``score`` (AULC, on the scale of ``returns``
+    where ``provenance.json`` has them) and ``last`` (mean return at the last checkpoint).
     """
     return _scores((cell, cell_folder(matrix.folder, cell)) for cell in matrix.runs)
 
@@ -140,8 +150,8 @@ def stored_scores(folder: Path) -> pd.DataFrame:
 
 
 def _scores(runs: Iterable[tuple[Cell, Path]]) -> pd.DataFrame:
-    curves = [(cell, partial_curve(path)) for cell, path in runs if is_finished(path)]
-    rows = [(*cell, aulc(curve), curve[-1].mean) for cell, curve in curves]
+    found = [(cell, partial_curve(path), read_about(path).get("returns")) for cell, path in runs if is_finished(path)]
+    rows = [(*cell, scaled(aulc(curve), returns), curve[-1].mean) for cell, curve, returns in found]
     return pd.DataFrame(rows, columns=[*Cell._fields, "score", "last"])
 
 

@@ -29,7 +29,7 @@ class Job:
         self.future: Any = None  # of the executor, while it is there
 
     def stop(self) -> None:
-        """End the run at its next evaluation, or at once if it waits."""
+        """End the run; what it has trained since its last evaluation is lost."""
         self.is_stopped = True
         if self.future is None:
             self.is_over = True

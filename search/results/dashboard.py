@@ -2,6 +2,7 @@
 
 from optuna import Study, Trial
 from optuna_dashboard import save_note
+from sb3_aarl.search.execution.matrix import task_name
 
 # Notes are attributes of the study, of which every page of the dashboard reads all.
 MAX_REASON = 300
@@ -28,6 +29,8 @@ def annotate_trial(trial: Trial) -> None:
     parents = " and trial ".join(map(str, attributes.get("parents", ())))
     origin = attributes.get("operation", "-") + (f" of trial {parents}" if parents else "")
     note = [f"### `{attributes.get('loss', 'no valid loss')}`", f"Generation {attributes.get('generation', 1)}: {origin}."]
+    if "scores" in attributes:  # of several environments
+        note.append(", ".join(f"{task_name(name)}: {score:.3f}" for name, score in attributes["scores"].items()))
     if "reason" in attributes:
         # Indented, a text is shown as it is.
         note += ["Reason of the failure:", "    " + " ".join(attributes["reason"].split())[:MAX_REASON]]

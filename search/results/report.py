@@ -25,8 +25,9 @@ N_BEST = 10
 
 
 def stored_baselines(folder: Path) -> list[tuple[str, float]]:
-    """Name and mean score of the baselines that have finished runs, from the folder of a search."""
-    means = stored_scores(folder / "baselines").groupby("variant")["score"].mean()
+    """Name and mean score of the baselines with finished runs on all environments, from the folder of a search."""
+    runs = stored_scores(folder / "baselines")
+    means = runs.pivot_table(index="variant", columns="environment", values="score").dropna().mean(axis=1)
     return [(str(name), float(score)) for name, score in means.items()]
 
 

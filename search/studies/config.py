@@ -2,13 +2,16 @@
 
 import inspect
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from pydantic import (
     AfterValidator,
     BaseModel,
     Field,
+    FiniteFloat,
     NonNegativeInt,
     PlainValidator,
     PositiveInt,
@@ -56,25 +59,58 @@ def _without_loss(overrides: dict[str, Any]) -> dict[str, Any]:
     return overrides
 
 
+def _two(returns: tuple[float, float]) -> tuple[float, float]:
+    if returns[0] >= returns[1]:
+        raise ValueError(f"must be the return that counts as 0 and a higher one that counts as 1, not {list(returns)}")
+    return returns
+
+
+def _distribution(value: Any) -> BaseDistribution:
+    """One of Optuna's, of a list of choices, or of a mapping with ``type``, ``low``, ``high``, ``log`` and ``step``."""
+    kinds = {"int": IntDistribution, "float": FloatDistribution}
+    try:
+        if isinstance(value, list):
+            return CategoricalDistribution(value)
+        return kinds[value["type"]](**{name: item for name, item in value.items() if name != "type"})
+    except (KeyError, TypeError):
+        wanted = "a list of choices, or {type: int or float, low: .., high: ..}, with log: true or step: .. if wanted"
+        raise ValueError(f"must be {wanted}, not {value}") from None
+
+
 Environment = Annotated[str, AfterValidator(training.resolve_env_id)]
 Environments = Annotated[tuple[Environment, ...], AfterValidator(_different)]
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0, lt=2**32)], ...], AfterValidator(_different)]
 Checkpoints = Annotated[tuple[PositiveInt, ...], AfterValidator(_ascending)]
 Overrides = Annotated[dict[str, Any], AfterValidator(_without_loss)]
+Returns = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_two)]
+
+
+class Task(BaseModel, frozen=True, extra="forbid"):
+    """
+    One of the ``environments`` of a search. A score on it is the AULC on the scale of ``returns``: the first one, such as a
+    random policy's, counts as 0, the second one as 1. ``checkpoints`` and ``overrides`` are its own, beside the search's.
+    """
+
+    environment: Environment
+    returns: Returns
+    checkpoints: Checkpoints | None = None
+    overrides: Overrides = {}
 
 
 class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     """
     Cross-validation of the ``top`` candidates of a search (paper, A.4), and of ``top_rated`` others that the surrogate of
-    ``screening`` rates highest: a score of one seed is noisy. ``checkpoints`` are the environment steps of the evaluations on
-    each environment, where they differ from the search's.
+    ``screening`` rates highest: a score of one seed is noisy. Without ``environments``, they are the search's. ``checkpoints``
+    are the environment steps of the evaluations on each environment, where they differ from the search's. ``returns`` are
+    those that count as 0 and 1 on environments that a search over several does not have.
     """
 
-    environments: Environments
+    environments: Environments = ()
     seeds: Seeds = (0, 1, 2)
     top: PositiveInt = 5
     top_rated: NonNegativeInt = 0
     checkpoints: dict[Environment, Checkpoints] = {}
+    returns: dict[Environment, Returns] = {}
 
 
 class Baseline(BaseModel, frozen=True, extra="forbid"):
@@ -95,6 +131,8 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     :param path: The file that it was read from
     :param imports: Modules that are imported first, such as those that register environments
     :param environment: Id of the environment, or the short form of a DeepMind Control task
+    :param environments: Several of them instead, on which each candidate is trained one after the other; its score is the
+        mean over them
     :param hyperparameters: File of hyper-parameters for ``load_hyperparameters``, relative to the file of the search, or the
         name of a shipped one; None for SACAux's defaults
     :param checkpoints: Environment steps of the evaluations, ascending; the last one ends the run
@@ -110,12 +148,15 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     :param cross_validation: Cross-validation, None where the configuration has none
     :param baselines: Runs that the candidates are compared with
     :param overrides: Merged over the hyper-parameters of all runs
+    :param space: Hyper-parameters that are searched beside the loss: by name (with dots in mappings, as ``aux_kwargs.coef``) a
+        list of choices, or a mapping with ``type`` (int or float), ``low``, ``high``, and ``log`` or ``step``
     """
 
     # Fields are validated in this order: validators of later ones use earlier ones.
     path: Annotated[Path, AfterValidator(Path.absolute)]
     imports: Annotated[tuple[str, ...], AfterValidator(training.import_modules)] = ()
-    environment: Environment
+    environments: Annotated[tuple[Task, ...], Field(validate_default=True)] = ()
+    environment: Annotated[Environment | None, Field(validate_default=True)] = None
     hyperparameters: Path | None = None
     checkpoints: Checkpoints
     evaluation_episodes: PositiveInt = 10
@@ -141,9 +182,24 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     cross_validation: CrossValidation | None = None
     baselines: tuple[Baseline, ...] = ()
     overrides: Overrides = {}
+    space: dict[str, Annotated[Any, PlainValidator(_distribution)]] = {}
     # The file of hyper-parameters, read once, and checked hyper-parameters by environment and baseline.
     _file: dict[str, Any] = PrivateAttr(default_factory=dict)
     _checked: dict[tuple[str, str | None], dict[str, Any]] = PrivateAttr(default_factory=dict)
+
+    @field_validator("environments")
+    @classmethod
+    def _environments_differ(cls, tasks: tuple[Task, ...]) -> tuple[Task, ...]:
+        if tasks:
+            _different(tuple(task.environment for task in tasks))
+        return tasks
+
+    @field_validator("environment")
+    @classmethod
+    def _one_or_several(cls, environment: str | None, info: ValidationInfo) -> str | None:
+        if (environment is None) != bool(info.data.get("environments", True)):
+            raise ValueError("is missing" if environment is None else "environments is there too: keep one of them")
+        return environment
 
     @field_validator("hyperparameters")
     @classmethod
@@ -177,12 +233,30 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
         """The name of the search's study: that of its file."""
         return self.path.stem
 
+    @property
+    def tasks(self) -> dict[str, Task | None]:
+        """The environments of the search, None for one that has no settings of its own."""
+        return {self.environment: None} if self.environment else {task.environment: task for task in self.environments}
+
+    def checkpoints_on(self, environment: str) -> tuple[int, ...]:
+        """The checkpoints of a candidate's run on an environment."""
+        task = self.tasks.get(environment)
+        return self.checkpoints if task is None or task.checkpoints is None else task.checkpoints
+
+    def returns_on(self, environment: str) -> tuple[float, float] | None:
+        """The returns that count as 0 and 1 on an environment; None where returns count as they are."""
+        if (task := self.tasks.get(environment)) is not None:
+            return task.returns
+        return self.cross_validation.returns.get(environment) if self.cross_validation else None
+
     def hyperparameters_for(self, environment: str, baseline: Baseline | None = None) -> dict[str, Any]:
         """The hyper-parameters of a run on an environment, with a baseline's overrides merged over them."""
         key = environment, None if baseline is None else baseline.name
         if key not in self._checked:
             if baseline is None:
-                values, overrides, of_whom = self._entry(environment), self.overrides, ""
+                task = self.tasks.get(environment)
+                values, of_whom = self._entry(environment), f"{environment}: " if task else ""
+                overrides = training.merge(self.overrides, task.overrides) if task else self.overrides
             else:
                 values, overrides = self.hyperparameters_for(environment), baseline.overrides
                 of_whom = f"baseline {baseline.name}: "
@@ -223,10 +297,29 @@ def load_config(path: str | Path, **changes: Any) -> SearchConfig:
         AuxLossSampler(**config.sampler_settings())
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
-    others = config.cross_validation.checkpoints if config.cross_validation else {}
-    validated = config.cross_validation.environments if config.cross_validation else ()
-    for env_id in dict.fromkeys([config.environment, *validated]):
-        for baseline in (None, *(config.baselines if env_id == config.environment else ())):
-            steps = {*others.get(env_id, config.checkpoints), *(config.checkpoints if env_id == config.environment else ())}
+    section = config.cross_validation
+    validated = (section.environments or tuple(config.tasks)) if section else ()
+    for env_id in dict.fromkeys([*config.tasks, *validated]):
+        for baseline in (None, *(config.baselines if env_id in config.tasks else ())):
+            steps = set(config.checkpoints_on(env_id) if env_id in config.tasks else ())
+            if section and env_id in validated:
+                steps |= {*section.checkpoints.get(env_id, config.checkpoints_on(env_id))}
             check_checkpoints(steps, config.hyperparameters_for(env_id, baseline), f"{path}: {env_id}")
+        if config.environments and env_id in validated and config.returns_on(env_id) is None:
+            raise ConfigError(f"{path}: cross_validation.returns: {env_id} is missing, with the returns that count as 0 and 1")
+    for name, distribution in config.space.items():
+        ends = getattr(distribution, "choices", None) or (distribution.low, distribution.high)
+        for env_id, value in product(config.tasks, ends):
+            values = merge_space(config.hyperparameters_for(env_id), {name: value})
+            training.check_hyperparameters(values, env_id, f"{path}: space.{name}")
     return config
+
+
+def merge_space(hyperparameters: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Hyper-parameters with the values of a search's ``space`` merged over them, by names with dots."""
+    merged = dict(hyperparameters)
+    for name, value in values.items():
+        for part in reversed(name.split(".")):
+            value = {part: value}
+        merged = training.merge(merged, value)
+    return merged

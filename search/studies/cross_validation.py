@@ -1,7 +1,8 @@
 """Cross-validation of a search's best candidates (paper, A.4): the best on one environment may have overfitted to it."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from sb3_aarl.search.evolution.surrogate import TokenModel
 from sb3_aarl.search.execution.matrix import Cell, Matrix
 from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
-from sb3_aarl.search.studies.search import check_study, make_run
+from sb3_aarl.search.studies.search import check_study, search_matrix
 from sb3_aarl.search.training.config import ConfigError
 from sb3_aarl.search.training.folder import Run
 
@@ -49,23 +50,23 @@ def make_matrix(
     """
     section = _section(config)
     check_study(study, config, free=("threads",))
-    if config.environment in section.environments and (own := sorted({*config.seeds} & {*section.seeds})):
-        logger.warning(
-            "cross_validation.seeds has %s, as the search on %s: the scores that candidates were chosen for count again",
-            ", ".join(map(str, own)),
-            config.environment,
-        )
+    if own := sorted({*config.seeds} & {*section.seeds}):
+        for environment in {*config.tasks} & {*(section.environments or config.tasks)}:
+            logger.warning(
+                "cross_validation.seeds has %s, as the search on %s: the scores that candidates were chosen for count again",
+                ", ".join(map(str, own)),
+                environment,
+            )
     losses = top_losses(study, section.top, section.top_rated) if top is None else top_losses(study, top)
     candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
-    runs = _make_runs(config, [*candidates, *baselines])
-    return Matrix(f"{study.study_name}-cross-validation", folder / "cross-validation", runs)
+    return _make_matrix(config, folder, [*candidates, *baselines])
 
 
-def all_runs(config: SearchConfig) -> dict[Cell, Run]:
+def all_runs(config: SearchConfig) -> Mapping[Cell, Run]:
     """Baselines, and candidates that are not known yet, each with AARL-State: what a cross-validation would cost."""
     loss, section = catalog.load("aarl-state"), _section(config)
     candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(section.top + section.top_rated)]
-    return _make_runs(config, [*candidates, *config.baselines])
+    return _make_matrix(config, Path(), [*candidates, *config.baselines]).runs
 
 
 def _section(config: SearchConfig) -> CrossValidation:
@@ -74,14 +75,16 @@ def _section(config: SearchConfig) -> CrossValidation:
     return config.cross_validation
 
 
-def _make_runs(config: SearchConfig, variants: Sequence[Baseline]) -> dict[Cell, Run]:
-    section, runs = _section(config), {}
-    for seed, environment, variant in product(section.seeds, section.environments, variants):
-        run = make_run(config, environment, variant.aux_loss, seed, variant)
-        # On the search's environment, runs may be longer than those of its candidates.
-        checkpoints = section.checkpoints.get(environment, config.checkpoints)
-        runs[Cell(variant.name, environment, seed)] = run.model_copy(update={"checkpoints": checkpoints})
-    return runs
+def _make_matrix(config: SearchConfig, folder: Path, variants: Sequence[Baseline]) -> Matrix:
+    section = _section(config)
+    by_name = {variant.name: variant for variant in variants}
+    environments = section.environments or tuple(config.tasks)
+    cells = [Cell(name, environment, seed) for seed, environment, name in product(section.seeds, environments, by_name)]
+    matrix = search_matrix(config, f"{config.name}-cross-validation", folder / "cross-validation", cells, by_name)
+    # On the search's environments, runs may be longer than those of its candidates.
+    checkpoints = {environment: {"checkpoints": steps} for environment, steps in section.checkpoints.items()}
+    runs = {cell: run.model_copy(update=checkpoints.get(cell.environment)) for cell, run in matrix.runs.items()}
+    return replace(matrix, runs=runs)
 
 
 def ranking(runs: pd.DataFrame) -> pd.DataFrame:

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import cached_property
 from itertools import product
@@ -10,16 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import optuna
+from optuna.distributions import CategoricalDistribution, IntDistribution, distribution_to_json
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
+from sb3_aarl.search.evolution.space import suggest_aux_loss
 from sb3_aarl.search.execution.driver import Driver, SearchProgress
 from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.matrix import Cell, Matrix
 from sb3_aarl.search.execution.storage import open_storage
-from sb3_aarl.search.studies.config import Baseline, SearchConfig, load_config
+from sb3_aarl.search.studies.config import Baseline, SearchConfig, load_config, merge_space
 from sb3_aarl.search.training.folder import FREE, Run, differences
 from sb3_aarl.search.training.setup import check_run
 
@@ -49,24 +51,50 @@ def make_run(
         aux_loss=None if aux_loss is None else str(aux_loss),
         hyperparameters=hyperparameters,
         seed=seed,
-        checkpoints=config.checkpoints,
+        checkpoints=config.checkpoints_on(environment),
         evaluation_episodes=config.evaluation_episodes,
         threads=config.threads,
         imports=tuple(config.imports),
     )
 
 
-def runs_of(config: SearchConfig) -> Callable[[AuxLoss], list[Run]]:
-    """A function from a candidate's loss to its runs, one for each seed."""
-    template = make_run(config, config.environment, None, config.seeds[0])
-    return lambda loss: [template.model_copy(update={"aux_loss": str(loss), "seed": seed}) for seed in config.seeds]
+def runs_of(config: SearchConfig) -> Callable[[optuna.Trial], list[Run]]:
+    """A function from a trial to its candidate's runs: on each environment, one for each seed."""
+    templates = [make_run(config, environment, None, config.seeds[0]) for environment in config.tasks]
+
+    def make_runs(trial: optuna.Trial) -> list[Run]:
+        changes = {"aux_loss": str(suggest_aux_loss(trial))}
+        seeds = seeds_of(config.seeds, trial.user_attrs.get("seed_index", 0))
+        values = {name: _suggest(trial, name, distribution) for name, distribution in config.space.items()}
+        runs = []
+        for template, seed in product(templates, seeds):
+            hyperparameters = merge_space(template.hyperparameters, values)
+            runs.append(template.model_copy(update={**changes, "hyperparameters": hyperparameters, "seed": seed}))
+        return runs
+
+    return make_runs
+
+
+def seeds_of(seeds: Sequence[int], index: int) -> tuple[int, ...]:
+    """The seeds of the runs of a loss, 0 for its first ones, and others each time that it is trained again."""
+    following = max(seeds) + 1 + (index - 1) * len(seeds)
+    return tuple(range(following, following + len(seeds))) if index else tuple(seeds)
+
+
+def _suggest(trial: optuna.Trial, name: str, distribution: Any) -> Any:
+    """The value of a hyper-parameter that is searched beside the loss."""
+    if isinstance(distribution, CategoricalDistribution):
+        return trial.suggest_categorical(name, distribution.choices)
+    suggest: Any = trial.suggest_int if isinstance(distribution, IntDistribution) else trial.suggest_float
+    return suggest(name, distribution.low, distribution.high, step=distribution.step, log=distribution.log)
 
 
 def all_runs(config: SearchConfig) -> list[Run]:
     """As many runs as a search without failures has, all with SACAux's default loss, for an estimate of the cost."""
     operations = AuxLossSampler(**config.sampler_settings()).operations
-    run = make_run(config, config.environment, None, config.seeds[0]).model_copy(update={"aux_loss": "auto"})
-    return [run] * sum(len(operations(number + 1)) for number in range(config.generations)) * len(config.seeds)
+    n_runs = sum(len(operations(number + 1)) for number in range(config.generations)) * len(config.seeds)
+    runs = [make_run(config, environment, None, config.seeds[0]) for environment in config.tasks]
+    return [run.model_copy(update={"aux_loss": "auto"}) for run in runs for _ in range(n_runs)]
 
 
 class Search:
@@ -86,7 +114,7 @@ class Search:
     def __init__(self, config: SearchConfig, folder: Path | None = None, storage: BaseStorage | str | None = None):
         self.config = config
         self.folder = Path("runs") / config.name if folder is None else folder
-        self._storage = storage
+        self._given = storage
 
     @classmethod
     def from_file(
@@ -98,16 +126,17 @@ class Search:
         :raises ConfigError: naming the file, when it cannot be used, or no run can be trained
         """
         config = load_config(path, **changes)
-        setup = check_run(make_run(config, config.environment, catalog.load("forward-dynamics"), config.seeds[0]), str(path))
-        if setup.episode_steps is not None and setup.episode_steps < (longest := config.max_horizon * setup.action_repeat):
-            message = "max_horizon is %d environment steps, episodes have %d: losses with longer horizons never have a window"
-            logger.warning(message, longest, setup.episode_steps)
+        for environment in config.tasks:
+            setup = check_run(make_run(config, environment, catalog.load("forward-dynamics"), config.seeds[0]), str(path))
+            if setup.episode_steps is not None and setup.episode_steps < (longest := config.max_horizon * setup.action_repeat):
+                message = "max_horizon is %d environment steps, episodes have %d: losses with longer horizons have no window"
+                logger.warning(message, longest, setup.episode_steps)
         return cls(config, folder, storage)
 
     @cached_property
     def storage(self) -> BaseStorage:
         """The storage of its study. A file of SQLite is created if it does not exist."""
-        return self._storage if isinstance(self._storage, BaseStorage) else open_storage(self.folder, self._storage)
+        return self._given if isinstance(self._given, BaseStorage) else open_storage(self.folder, self._given)
 
     @cached_property
     def study(self) -> optuna.Study:
@@ -116,7 +145,7 @@ class Search:
 
         :raises ValueError: if it was started with other settings, naming the first one
         """
-        config, names = self.config, optuna.get_all_study_names(self.storage) if self._storage is None else []
+        config, names = self.config, optuna.get_all_study_names(self.storage) if self._given is None else []
         if others := ", ".join(name for name in names if name != config.name):
             raise ValueError(f"{self.folder} is the folder of the search {others}: choose another folder (--folder)")
         sampler = AuxLossSampler(**config.sampler_settings())
@@ -150,7 +179,8 @@ class Search:
 
         annotate_study(self.study)
         runs, retries = runs_of(self.config), self.config.retries
-        driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, annotate_trial)
+        returns = {environment: self.config.returns_on(environment) for environment in self.config.tasks}
+        driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, annotate_trial, returns)
         with closing(iter(driver)) as progresses:
             for progress in progresses:
                 on_progress(progress)
@@ -162,30 +192,54 @@ def make_pruner(config: SearchConfig) -> BasePruner:
     if config.pruner == "median":
         return MedianPruner()
     if config.pruner == "hyperband":
-        return HyperbandPruner(min_resource=config.checkpoints[0], max_resource=config.checkpoints[-1])
+        # Steps of reports: environments that are done, or environment steps where there is one environment.
+        steps = [*range(1, len(config.tasks) + 1)] if len(config.tasks) > 1 else config.checkpoints_on(*config.tasks)
+        return HyperbandPruner(min_resource=steps[0], max_resource=steps[-1])
     return NopPruner()
 
 
 def baselines(config: SearchConfig, folder: Path) -> Matrix:
-    """The runs that the candidates are compared with, on the environment and the seeds of the search."""
-    environment, runs = config.environment, {}
-    for seed, baseline in product(config.seeds, config.baselines):
-        run = make_run(config, environment, baseline.aux_loss, seed, baseline)
-        runs[Cell(baseline.name, environment, seed)] = run
-    return Matrix(f"{config.name}-baselines", folder / "baselines", runs)
+    """The runs that the candidates are compared with, on the environments and the seeds of the search."""
+    variants = {baseline.name: baseline for baseline in config.baselines}
+    cells = [Cell(name, environment, seed) for seed, environment, name in product(config.seeds, config.tasks, variants)]
+    return search_matrix(config, f"{config.name}-baselines", folder / "baselines", cells, variants)
+
+
+def search_matrix(
+    config: SearchConfig, name: str, folder: Path, cells: Sequence[Cell], variants: Mapping[str, Baseline]
+) -> Matrix:
+    """A matrix of runs with the settings of a search."""
+    runs, abouts = {}, {}
+    for cell in cells:
+        variant = variants[cell.variant]
+        runs[cell] = make_run(config, cell.environment, variant.aux_loss, cell.seed, variant)
+        if (returns := config.returns_on(cell.environment)) is not None:
+            abouts[cell] = {"returns": returns}
+    return Matrix(name, folder, runs, abouts)
 
 
 def settings(config: SearchConfig) -> dict[str, Any]:
     """The settings that decide the scores of a search, as plain values. The sampler stores its own."""
-    run = make_run(config, config.environment, None, 0)
-    values = run.model_dump(exclude={"aux_loss", "hyperparameters", "keep_model", "seed"})
+    runs = {environment: make_run(config, environment, None, 0) for environment in config.tasks}
+    exclude = {"aux_loss", "hyperparameters", "keep_model", "seed"}
+    values = next(iter(runs.values())).model_dump(exclude=exclude)
     values |= {
         "evolution_seed": config.evolution_seed,
         "seeds": config.seeds,
         "n_generations": config.generations,
         "pruner": config.pruner,
     }
-    return json.loads(json.dumps(values | run.hyperparameters))
+    if config.space:
+        values["space"] = {name: distribution_to_json(distribution) for name, distribution in config.space.items()}
+    if config.environments:
+        values["environments"] = {
+            environment: {"returns": config.returns_on(environment), "checkpoints": run.checkpoints, **run.hyperparameters}
+            for environment, run in runs.items()
+        }
+        values = {key: value for key, value in values.items() if key not in ("environment", "checkpoints")}
+    else:
+        values |= runs[config.environment].hyperparameters
+    return json.loads(json.dumps(values))
 
 
 def stored_settings(study: optuna.Study) -> dict[str, Any]:
@@ -204,7 +258,11 @@ def check_study(study: optuna.Study, config: SearchConfig, free: Sequence[str] =
     if study.directions != [StudyDirection.MAXIMIZE]:
         problem = f"its directions are {[direction.name.lower() for direction in study.directions]}, not one to maximize"
     elif stored is not None:
-        found = [item for item in differences(stored, settings(config)) if item[0] not in (*FREE, *FREE_OF_SEARCH, *free)]
+        found = [
+            item
+            for item in differences(stored, settings(config))
+            if item[0].rpartition(".")[2] not in (*FREE, *FREE_OF_SEARCH, *free)
+        ]
         problem = next((f"it was started with {key}={old!r}, not {new!r}" for key, old, new in found), None)
     if problem is not None:
         raise ValueError(f"study {study.study_name!r} is not this search: {problem}. {ADVICE}")

@@ -86,7 +86,10 @@ def load(model: SACAux, state: Mapping[str, Any]) -> None:
     """Put a checkpoint into a new model with the same settings, and into its environment."""
     assert isinstance(model.replay_buffer, WindowReplayBuffer)
     model.load_training_state(state["model"])
-    model.replay_buffer.load_training_state(state["replay_buffer"])
+    buffer, stored = model.replay_buffer, state["replay_buffer"]
+    if stored["n_added"] < stored["buffer_size"] < buffer.buffer_size:  # the run was to be shorter, with a smaller buffer
+        stored = {**stored, "buffer_size": buffer.buffer_size}
+    buffer.load_training_state(stored)
     for name, statistics in _statistics(model.get_vec_normalize_env()).items():
         mean, var, count = state["normalization"][name]
         statistics.mean, statistics.var, statistics.count = mean.numpy(), var.numpy(), count
@@ -107,8 +110,9 @@ def remove(folder: Path) -> None:
 
 class CheckpointCallback(BaseCallback):
     """
-    After each evaluation, save the run when the rollout that was evaluated is stored and trained on, and restart it. Training
-    ends if ``on_save`` returns False; ``state`` is the checkpoint from which the run is resumed.
+    After each evaluation, save the run when the rollout that was evaluated is stored and trained on, call ``on_save``, and
+    restart it. When the file ``stop`` exists, training ends at once: what follows the last evaluation is lost, and the
+    checkpoint stays. ``state`` is the checkpoint from which the run is resumed.
     """
 
     model: SACAux
@@ -118,7 +122,8 @@ class CheckpointCallback(BaseCallback):
         folder: Path,
         seed: int,
         curve: list[Evaluation],
-        on_save: Callable[[], bool],
+        on_save: Callable[[], object],
+        stop: Path,
         state: Mapping[str, Any] | None = None,
     ):
         super().__init__()
@@ -126,6 +131,7 @@ class CheckpointCallback(BaseCallback):
         self.seed = seed
         self.curve = curve
         self.on_save = on_save
+        self.stop = stop
         self.stopped = False
         self._state = state
         self._n_saved = len(curve)
@@ -140,10 +146,12 @@ class CheckpointCallback(BaseCallback):
         if is_due:
             save(self.folder, self.model, self.curve)
             self._n_saved = len(self.curve)
-            self.stopped = not self.on_save()
+            self.on_save()
         if is_due or self._state is not None:
             restart(self.model, self.seed)
             self._state = None
 
     def _on_step(self) -> bool:
+        is_saved = len(self.curve) == self._n_saved
+        self.stopped = is_saved and self.stop.exists()
         return not self.stopped

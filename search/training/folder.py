@@ -59,7 +59,8 @@ class Outcome(NamedTuple):
 
 def prepare_run(folder: Path, run: Run) -> None:
     """
-    Create the folder of a run, or reuse it: files that ended the run before are deleted.
+    Create the folder of a run, or reuse it: files that ended the run before are deleted. A run that was stopped may have more
+    checkpoints than it had, unless its learning rates depend on its length.
 
     :raises ValueError: when the folder has another run, naming the key that differs
     """
@@ -67,8 +68,12 @@ def prepare_run(folder: Path, run: Run) -> None:
     values = run.model_dump(mode="json")
     if (folder / RUN).exists():
         stored = read_run(folder).model_dump(mode="json")
+        free = [f"hyperparameters.{name}" for name in FREE]
+        is_longer = values["checkpoints"][: len(stored["checkpoints"])] == stored["checkpoints"]
+        if is_longer and '"lin_' not in json.dumps(stored["hyperparameters"]) and not is_finished(folder):
+            free.append("checkpoints")
         for key, ours, theirs in differences(values, stored):
-            if key not in [f"hyperparameters.{name}" for name in FREE]:
+            if key not in free:
                 there, here = ("not set" if value is None else repr(value) for value in (theirs, ours))
                 raise ValueError(
                     f"{folder} has another run: {key} is {there} there, {here} here. Choose another folder (--folder)"

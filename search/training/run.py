@@ -24,6 +24,7 @@ from sb3_aarl.search.training.folder import (
     Run,
     is_finished,
     one_line,
+    partial_curve,
     prepare_run,
     read_run,
 )
@@ -31,7 +32,7 @@ from sb3_aarl.search.training.provenance import add_session, read_about, write_a
 from sb3_aarl.search.training.setup import Setup, check_run
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, read_curve, write_curve
+from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, write_curve
 from sb3_aarl.files import replace_text
 
 # What is needed to train a run from Python.
@@ -55,7 +56,8 @@ def train(
     bit for bit like an undisturbed one if ``reset(seed)`` determines all that its environment does.
 
     :param folder: Folder that :func:`prepare_run` has prepared
-    :param on_evaluation: Called with the curve so far after each evaluation; a file ``stop`` in the folder ends the run there
+    :param on_evaluation: Called with the curve so far after each evaluation. A file ``stop`` in the folder ends the run at
+        once; its last checkpoint stays
     :return: The learning curve; that of a finished run is read, not trained again
     :raises filelock.Timeout: when another process trains it for longer than a minute
     """
@@ -68,8 +70,9 @@ def train(
             except FloatingPointError:  # it would fail again from the checkpoint
                 checkpoint.remove(folder)
                 raise
-        checkpoint.remove(folder)
-        return read_curve(folder / CURVE)
+        if is_finished(folder):
+            checkpoint.remove(folder)
+        return partial_curve(folder)
 
 
 def _train(folder: Path, run: Run, progress_bar: bool, on_evaluation: Callable[[list[Evaluation]], object] | None) -> None:
@@ -91,15 +94,14 @@ def _train(folder: Path, run: Run, progress_bar: bool, on_evaluation: Callable[[
             curve=curve,
         )
 
-        def report() -> bool:
+        def report() -> None:
             model.dump_logs()  # as SB3 does every fourth episode: TensorBoard has a point for each evaluation, the last too
             write_curve(folder / CURVE, evaluations.curve)
             if on_evaluation is not None:
                 on_evaluation(evaluations.curve)
-            return not (folder / STOP).exists()
 
         add_session(folder, aux_loss=str(model.aux_loss), device=str(model.device), threads=run.threads)
-        checkpoints = checkpoint.CheckpointCallback(folder, run.seed, evaluations.curve, report, state)
+        checkpoints = checkpoint.CheckpointCallback(folder, run.seed, evaluations.curve, report, folder / STOP, state)
         del state  # mapped from a file that will be replaced
         model.learn(setup.agent_steps, [evaluations, checkpoints], progress_bar=progress_bar)
         if not checkpoints.stopped:
