@@ -4,24 +4,20 @@ RL-Zoo's own programs with SACAux, as ``sac_aux``, and with DeepMind Control as 
     python -m sb3_aarl.rl_zoo train --algo sac_aux --env dm_control/cheetah-run-v0 -conf zoo_configs/paper/aarl_state.yml
     python -m sb3_aarl.rl_zoo enjoy --algo sac_aux --env dm_control/cheetah-run-v0 -f logs
     python -m sb3_aarl.rl_zoo record_video --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
-    python -m sb3_aarl.rl_zoo record_training --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -n 250
-    python -m sb3_aarl.rl_zoo plot_train -a sac_aux -e dm_control/cheetah-run-v0 -f logs
-    python -m sb3_aarl.rl_zoo all_plots -a sac_aux sac -e dm_control/cheetah-run-v0 -f logs -o curves
-    python -m sb3_aarl.rl_zoo plot_from_file -i curves
     python -m sb3_aarl.rl_zoo load_from_hub --algo sac_aux --env dm_control/cheetah-run-v0 -f logs -orga NAME
 
 ``--gym-packages my_envs`` imports modules that register environments, in every program that makes some.
 
 ``train -optimize`` samples what RL-Zoo samples for SAC, and ``policy_kwargs`` are RL-Zoo's own then, not the file's.
 
-Everything after the program's name is RL-Zoo's: see ``python -m sb3_aarl.rl_zoo train --help``.
+Everything after the program's name is RL-Zoo's: see ``python -m sb3_aarl.rl_zoo train --help``. RL-Zoo's programs for plots
+read log files alone: ``python -m rl_zoo3.plots.plot_train -a sac_aux -e dm_control-cheetah-run-v0 -f logs``.
 """
 
 import argparse
 import functools
 import importlib
 import runpy
-import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.resources import files
@@ -33,12 +29,10 @@ from sb3_aarl.envs import env_ids, make_dmc_env  # first: it chooses the rendere
 from sb3_aarl.files import ConfigError, read_yaml
 from sb3_aarl.sac_aux import SACAux
 
-# Functions in RL-Zoo's modules, each of its own name; the others are scripts. push_to_hub is missing: RL-Zoo 2.9.2's fails for
-# all algorithms, as it imports a function that sb3-team-hf-integration 3.2 does not have.
-FUNCTIONS = {"train": "rl_zoo3.train", "enjoy": "rl_zoo3.enjoy"} | dict.fromkeys(
-    ("plot_train", "all_plots", "plot_from_file"), "rl_zoo3.plots"
-)
-PROGRAMS = (*FUNCTIONS, "record_video", "record_training", "load_from_hub")
+# The first two are functions in modules of RL-Zoo, the others scripts. push_to_hub is missing: RL-Zoo 2.9.2's fails for all
+# algorithms, as it imports a function that sb3-team-hf-integration 3.2 does not have.
+FUNCTIONS = ("train", "enjoy")
+PROGRAMS = (*FUNCTIONS, "record_video", "load_from_hub")
 
 
 def register() -> None:
@@ -70,9 +64,8 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
     Arguments of ``train`` with the ``env_kwargs`` of its file of hyper-parameters as ``--env-kwargs``.
 
     RL-Zoo passes those of the file to the training environment only; those of the command line are stored with the model
-    and reach evaluations, ``enjoy`` and ``record_video`` too. Given ones win.
-
-    Without a file ``sac_aux`` has those of ``zoo_configs/sac_aux.yml``: SACAux's own.
+    and reach evaluations, ``enjoy`` and ``record_video`` too. Values of the command line win. Without a file, ``sac_aux`` has
+    ``zoo_configs/sac_aux.yml``.
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_aarl.rl_zoo train", add_help=False)
     parser.add_argument("--algo")
@@ -88,16 +81,12 @@ def with_env_kwargs(arguments: Sequence[str]) -> list[str]:
         return list(arguments)
     try:
         entries = read_yaml(path)
+        env_kwargs = entries.get(known.env, entries.get("default", {})).get("env_kwargs") or {}
+        values = [f"{key}:{value!r}" for key, value in env_kwargs.items()]
     except ConfigError as error:
         parser.error(str(error))
-    entry = entries.get(known.env, entries.get("default", {}))
-    if not isinstance(entry, dict):
-        parser.error(f"{path}: {known.env if known.env in entries else 'default'} must be a mapping, not {entry!r}")
-    env_kwargs = {} if entry.get("env_kwargs") is None else entry["env_kwargs"]
-    # RL-Zoo evaluates all behind the colon as Python.
-    if not isinstance(env_kwargs, dict) or not all(str(key).isidentifier() for key in env_kwargs):
-        parser.error(f"{path}: env_kwargs must be a mapping from arguments of the environment to values, not {env_kwargs!r}")
-    values = [f"{key}:{value!r}" for key, value in env_kwargs.items()]
+    except AttributeError:
+        parser.error(f"{path}: the entry of {known.env} and its env_kwargs must be mappings")
     return [*arguments, "--env-kwargs", *values, *known.env_kwargs] if values else list(arguments)
 
 
@@ -116,26 +105,17 @@ def main() -> None:
         known, arguments = packages.parse_known_args(arguments)
         for name in known.gym_packages:
             importlib.import_module(name)
-    elif program == "record_training":
-        # It starts a process of record_video for each model: ours, which knows SACAux.
-        call = subprocess.call
-        ours = [sys.executable, "-m", "sb3_aarl.rl_zoo", "record_video"]
-        subprocess.call = lambda command: call([*ours, *command[3:]])  # type: ignore[assignment, misc]
-    elif program in ("plot_train", "all_plots"):
-        # They look for folders, in whose names RL-Zoo has a dash for the slash.
-        arguments = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
     try:
         register()
-        if program == "train":
-            arguments = with_env_kwargs(arguments)
-        run = getattr(importlib.import_module(FUNCTIONS[program]), program) if program in FUNCTIONS else None
     except ModuleNotFoundError as error:
         parser.error(f"{error}: pip install 'sb3-aarl[zoo]'")
+    if program == "train":
+        arguments = with_env_kwargs(arguments)
     sys.argv = [f"{parser.prog} {program}", *arguments]
-    if run is None:
-        runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
+    if program in FUNCTIONS:
+        getattr(importlib.import_module(f"rl_zoo3.{program}"), program)()
     else:
-        run()
+        runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,6 @@
 """RL-Zoo's own programs with SACAux and our files of hyper-parameters."""
 
-import os
 import re
-import shutil
-import subprocess
 import sys
 from ast import literal_eval
 from pathlib import Path
@@ -16,31 +13,20 @@ from stable_baselines3.common.monitor import load_results
 from sb3_aarl import SACAux, catalog
 from sb3_aarl.encoders import DenseMLP
 from sb3_aarl.envs import make_dmc_env
-from sb3_aarl.rl_zoo import with_env_kwargs
+from sb3_aarl.rl_zoo import main, with_env_kwargs
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 TASK = "dm_control/cheetah-run-v0"
 SAC_AUX = ["--algo", "sac_aux", "--env", TASK]
 
 
-def run(folder: Path, *command: str) -> str:
-    """What a Python process prints."""
-    done = subprocess.run(
-        [sys.executable, *command],
-        cwd=folder,
-        env={**os.environ, "MPLBACKEND": "agg"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def in_one_process(folder: Path, *programs: list[str], then: str = "") -> str:
-    """What programs of RL-Zoo print, one after the other: importing takes longer than all they do."""
-    lines = [f"sys.argv = {['', *program]}\nmain()" for program in programs]
-    return run(folder, "-c", "\n".join(["import sys", "from sb3_aarl.rl_zoo import main", *lines, then]))
+def run(folder: Path, *arguments: str) -> None:
+    """A program of RL-Zoo, in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(folder)
+        patch.setattr(sys, "argv", ["sb3_aarl.rl_zoo", *arguments])
+        main()
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +36,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("zoo")
     small = ["-params", "learning_starts:260", "batch_size:8", "buffer_size:500"]
     settings = ["-n", "280", "--eval-freq", "135", "--eval-episodes", "2", "--device", "cpu", "--seed", "3", *small]
-    run(folder, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "paper/aarl_state.yml"), *settings)
+    run(folder, "train", *SAC_AUX, "-conf", str(ZOO / "paper/aarl_state.yml"), *settings)
     return folder / "logs/sac_aux/dm_control-cheetah-run-v0_1"
 
 
@@ -72,20 +58,12 @@ def test_trains_with_the_hyperparameters_of_the_file(trained: Path) -> None:
 
 
 @pytest.mark.slow
-def test_enjoy_record_video_and_plots(trained: Path) -> None:
+def test_enjoy_and_record_video(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = trained.parents[2]
-    for i in (1, 2):  # plot_from_file needs two runs
-        copy = folder / "two/sac_aux" / trained.name.replace("_1", f"_{i}")
-        shutil.copytree(trained, copy, ignore=shutil.ignore_patterns("*.zip"))
-    programs = [
-        ["enjoy", *SAC_AUX, "-f", "logs", "-n", "260", "--no-render", "--device", "cpu", "--seed", "5"],
-        ["record_video", *SAC_AUX, "-f", "logs", "-n", "3", "-o", "videos"],
-        ["all_plots", "-a", "sac_aux", "-e", TASK, "-f", "two", "-o", "curves", "--no-display"],
-        ["plot_from_file", "-i", "curves"],
-        ["plot_train", "-a", "sac_aux", "-e", TASK, "-f", "logs", "-w", "1"],
-    ]
-    n_points = "from matplotlib import pyplot as plt; print([len(line.get_xdata()) for line in plt.gca().lines])"
-    printed = in_one_process(folder, *programs, then=n_points)
+    run(folder, "enjoy", *SAC_AUX, "-f", "logs", "-n", "260", "--no-render", "--device", "cpu", "--seed", "5")
+    printed = capsys.readouterr().out
+    run(folder, "record_video", *SAC_AUX, "-f", "logs", "-n", "3", "-o", "videos")
+    assert [path.suffix for path in (folder / "videos").iterdir()] == [".mp4"]
 
     model = SACAux.load(trained / "dm_control-cheetah-run-v0.zip", device="cpu")
     env = make_dmc_env(TASK, action_repeat=4)
@@ -97,22 +75,6 @@ def test_enjoy_record_video_and_plots(trained: Path) -> None:
         episode_reward += float(reward)
     assert truncated
     assert f"Episode Reward: {episode_reward:.2f}\nEpisode Length 250\n" in printed
-    assert [path.suffix for path in (folder / "videos").iterdir()] == [".mp4"]
-    rows = [line.split("|")[1:-1] for line in printed.splitlines() if line.startswith("|dm_control-cheetah-run-v0")]
-    last = np.load(trained / "evaluations.npz")["results"][-1].mean()
-    assert [row[1].split("+/-")[0].strip() for row in rows] == [f"{last:.0f}"] * 2  # all_plots, plot_from_file
-    assert printed.endswith("[1]\n")  # one curve, of one episode
-
-
-@pytest.mark.slow
-def test_records_training(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="pip install 'sb3-aarl[zoo]'").get_ffmpeg_exe()
-    (tmp_path / "ffmpeg").symlink_to(ffmpeg)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    program = ["-m", "sb3_aarl.rl_zoo", "record_training", *SAC_AUX, "-n", "3"]
-    run(tmp_path, *program, "-f", str(trained.parents[1]), "-o", str(tmp_path / "videos"))
-    names = sorted(path.name.partition("-sac_aux")[0] for path in (tmp_path / "videos").iterdir())
-    assert names == ["best-model", "final-model", "training.mp4"]
 
 
 MY_ENVS = """
@@ -139,11 +101,8 @@ def test_an_environment_of_ones_own_needs_no_program(tmp_path: Path) -> None:
     for name, text in (("my_envs.py", MY_ENVS), ("small.yml", SMALL)):
         (tmp_path / name).write_text(text)
     mine = ["--algo", "sac_aux", "--env", "Mine-v0", "--gym-packages", "my_envs"]
-    in_one_process(
-        tmp_path,
-        ["train", *mine, "-conf", "small.yml", "--eval-freq", "-1", "--device", "cpu"],
-        ["record_video", *mine, "-f", "logs", "-n", "3", "-o", "videos"],
-    )
+    run(tmp_path, "train", *mine, "-conf", "small.yml", "--eval-freq", "-1", "--device", "cpu")
+    run(tmp_path, "record_video", *mine, "-f", "logs", "-n", "3", "-o", "videos")
     model = SACAux.load(tmp_path / "logs/sac_aux/Mine-v0_1/Mine-v0.zip", device="cpu")
     assert model.num_timesteps == 60 and model._n_updates == 20 and model.observation_space.shape == (2 * 3 + 2,)
     assert [model.lr_schedule(share) for share in (1, 0.5)] == [1e-3, 5e-4]
@@ -162,7 +121,7 @@ def test_optimizes_what_rl_zoo_optimizes_of_sac(tmp_path: Path) -> None:
     trials = ["-optimize", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1", "--sampler", "random"]
     trials += ["--pruner", "none"]  # RL-Zoo prunes failed trials; a pruner might prune the second trial
     settings = ["-n", "280", "--eval-episodes", "1", "--device", "cpu", "--seed", "3", "-params", "learning_starts:260"]
-    run(tmp_path, "-m", "sb3_aarl.rl_zoo", "train", *SAC_AUX, "-conf", str(ZOO / "paper/aarl_state.yml"), *trials, *settings)
+    run(tmp_path, "train", *SAC_AUX, "-conf", str(ZOO / "paper/aarl_state.yml"), *trials, *settings)
     (report,) = (tmp_path / "logs" / "sac_aux").glob("report_*.csv")
     rows = pd.read_csv(report)
     assert list(rows["state"]) == ["COMPLETE"] * 2 and rows["value"].notna().all()
@@ -186,14 +145,6 @@ def test_what_is_not_ours_stays(arguments: list[str]) -> None:
     assert with_env_kwargs(arguments) == arguments
 
 
-@pytest.mark.parametrize("key", ["action_repeat:__import__('os').system('touch executed')or 2#", "action repeat", ""])
-def test_what_rl_zoo_would_evaluate_is_refused(key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "own.yml").write_text(f'default: {{env_kwargs: {{"{key}": 1}}}}')
-    with pytest.raises(SystemExit):
-        with_env_kwargs([*SAC_AUX, "-conf", str(tmp_path / "own.yml")])
-    assert "env_kwargs must be a mapping from arguments of the environment to values, not" in capsys.readouterr().err
-
-
 def test_plain_values_reach_rl_zoo_as_they_are(tmp_path: Path) -> None:
     values = "{a: 1, b: [1, -2.5, null], c: {d: true}, e: 'x: __import__(1)#', f: \"'quoted'\"}"
     (tmp_path / "own.yml").write_text(f"default: {{env_kwargs: {values}}}")
@@ -205,32 +156,22 @@ def test_plain_values_reach_rl_zoo_as_they_are(tmp_path: Path) -> None:
     ("content", "message"),
     [
         (None, "cannot be read: No such file"),
-        (b"[1, 2]", "must hold a mapping"),
-        (b"", "must hold a mapping"),
-        (b"{a: b", "line 1"),
-        (b"!!python/object/apply:os.getcwd []", "line 1"),
-        (b"# r\xe9glages\ndefault: {}", "utf-8"),
-        (b"default: 3", "default must be a mapping, not 3"),
-        (b"default: {env_kwargs: [g]}", "env_kwargs must be a mapping"),
-        (b"default: {env_kwargs: 0}", "env_kwargs must be a mapping"),
-        (b"default: {env_kwargs: 'dict(g=1)'}", "env_kwargs must be a mapping"),
-        (b"default: {env_kwargs: {g: 1, g: 2}}", "line 1: 'g' is there twice"),
+        ("default: 3", "must be mappings"),
+        ("default: {env_kwargs: 'dict(g=1)'}", "must be mappings"),
     ],
 )
 def test_one_error_for_a_file_that_cannot_be_used(
-    content: bytes | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "own.yml"
     if content is not None:
-        path.write_bytes(content)
+        path.write_text(content)
     with pytest.raises(SystemExit):
         with_env_kwargs([*SAC_AUX, "-conf", str(path)])
     assert re.search(rf"error: {path}: .*{message}", capsys.readouterr().err)
 
 
-@pytest.mark.parametrize(
-    "text", ["default: {env_kwargs: }", f"{TASK}: {{env_kwargs: null}}", "default: {batch_size: 8}", "a: {}"]
-)
+@pytest.mark.parametrize("text", ["default: {env_kwargs: }", "default: {batch_size: 8}", "a: {}"])
 def test_no_arguments_of_the_environment(text: str, tmp_path: Path) -> None:
     (tmp_path / "own.yml").write_text(text)
     arguments = [*SAC_AUX, "-conf", str(tmp_path / "own.yml")]
@@ -240,4 +181,3 @@ def test_no_arguments_of_the_environment(text: str, tmp_path: Path) -> None:
 def test_without_a_file_it_has_the_defaults() -> None:
     arguments = with_env_kwargs(SAC_AUX)
     assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "sac_aux.yml" and added(arguments) == {"action_repeat": 4}
-    assert Path(with_env_kwargs(["--algo", "sac_aux", "--env", "Pendulum-v1"])[-1]) == ZOO / "sac_aux.yml"

@@ -127,7 +127,7 @@ def pattern_scores(
 ) -> dict[str, tuple[pd.Series, pd.Series]]:
     """The scores of the trials with and of those without each pattern, those in neither class left out."""
     scores, classes = analysed(table)["score"], table5_classes(table, patterns)
-    return {name: (scores[classes[name].fillna(False)], scores[~classes[name].fillna(True)]) for name in classes}
+    return {str(name): (scores[column.fillna(False)], scores[~column.fillna(True)]) for name, column in classes.items()}
 
 
 def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS) -> pd.DataFrame:
