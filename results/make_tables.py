@@ -1,0 +1,213 @@
+"""
+Write all tables of results: table.md of each experiment, the index in README.md, and the tables of both README.md.
+
+Every number of a run comes from its curve.csv and provenance.json; tables.yml says which runs a table of a README.md shows.
+"""
+
+import math
+import os
+import re
+import runpy
+import statistics
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+from rich.table import Table
+from rich.text import Text
+from sb3_aarl.search.cli.results import ANALYSES, N_IMPORTANCES
+from sb3_aarl.search.execution.matrix import stored_scores, task_name
+from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
+from sb3_aarl.search.results import analysis, table
+from sb3_aarl.search.studies.benchmark import read_abouts
+from sb3_aarl.search.studies.cross_validation import ranking
+from sb3_aarl.search.studies.search import SETTINGS_KEY
+from sb3_aarl.search.training.provenance import read_about
+from scipy.stats import mannwhitneyu
+
+from sb3_aarl.callbacks import read_curve
+
+RESULTS = Path(__file__).resolve().parent
+ROOT = RESULTS.parent
+SOURCE = "results/make_tables.py"
+# What a search does to losses; the others are drawn at random, from priors, or given.
+EVOLVED = ("crossover", "replacement", "horizon_change")
+DRAWN, BEST = 20, 10
+
+
+def texts() -> dict[Path, str]:
+    """All files that this script writes, and their text."""
+    tables = {name: readme_table(rows) for name, rows in yaml.safe_load((RESULTS / "tables.yml").read_text("utf-8")).items()}
+    abouts = sorted(RESULTS.glob("*/*/about.md"))
+    tables["index"] = markdown([("experiment", "question", "answer"), *map(summary, abouts)])
+    files = {path: filled(path.read_text(encoding="utf-8"), tables) for path in (ROOT / "README.md", RESULTS / "README.md")}
+    for folder in (about.parent for about in abouts):
+        if (folder / STUDY_FILE).exists():
+            files[folder / "table.md"] = page(folder, search_tables(folder))
+        elif (folder / "runs").exists():
+            files[folder / "table.md"] = page(folder, benchmark_tables(folder))
+    return files
+
+
+def filled(text: str, tables: dict[str, str]) -> str:
+    """A text whose tables are replaced, each between a comment that names it and one that ends it."""
+    for name in re.findall(rf"<!-- {SOURCE}: (\w+) -->", text):
+        start, end = f"<!-- {SOURCE}: {name} -->\n", "<!-- end -->"
+        before, _, rest = text.partition(start)
+        text = before + start + tables[name] + "\n" + end + rest.partition(end)[2]
+    return text
+
+
+def readme_table(rows: list[list[str]]) -> str:
+    """A table of tables.yml."""
+    return markdown(
+        [[returns(RESULTS / cell) if any((RESULTS / cell).glob("seed-*")) else cell for cell in row] for row in rows]
+    )
+
+
+def returns(folder: Path) -> str:
+    """The last returns of the runs in a folder, one for each seed: mean, deviation, number."""
+    last = [read_curve(path)[-1].mean for path in folder.glob("seed-*/curve.csv")]
+    deviation = f" ± {statistics.stdev(last):,.0f}" if len(last) > 1 else ""
+    return f"{statistics.mean(last):,.0f}{deviation} ({len(last)})"
+
+
+def summary(about: Path) -> tuple[str, str, str]:
+    """A row of the index: an experiment, its question, and the first sentence of its answer."""
+    text = " ".join(about.read_text(encoding="utf-8").split())
+    parts = dict(re.findall(r"\*\*(Question|Answer)\.\*\* (.*?[.?])(?: |$)", text))
+    name = about.parent.relative_to(RESULTS).as_posix()
+    return f"[{name}]({name}/about.md)", parts["Question"], parts["Answer"]
+
+
+def page(folder: Path, parts: Iterable[str]) -> str:
+    """A table.md."""
+    name = folder.relative_to(RESULTS).as_posix()
+    return (
+        "\n\n".join([f"# Tables of {name}", f"Written by `python {SOURCE}`. What they mean: [about.md](about.md).", *parts])
+        + "\n"
+    )
+
+
+def benchmark_tables(folder: Path) -> Iterator[str]:
+    """What ``aarl table`` shows of a benchmark, and its runs."""
+    found = table.read_tables(folder)
+    for shown in table.terminal_tables(found):
+        yield f"## {shown.title}\n\n{from_terminal(shown)}"
+    yield "\n\n".join([*table.footnotes(found), *table.missing(found.runs), *table.mixed(found.runs)])
+    heads = ("run", "return", "mean of the evaluations", "minutes", "threads", "processor", "commit", "date")
+    yield "## Runs\n\n" + markdown([heads, *(run_row(path, folder, about) for path, about in read_abouts(folder).items())])
+
+
+def run_row(path: Path, folder: Path, about: dict[str, Any]) -> list[str]:
+    """A run: its curve, what it found, where and how long it was trained."""
+    curve, sessions = read_curve(path / "curve.csv"), about["sessions"]
+    name = f"{about['variant']}/{task_name(about['environment'])}/seed-{about['seed']}"
+    processor = "cpu" if sessions[-1]["gpu"] == "none" else "gpu"
+    return [
+        f"[{name}]({os.path.relpath(path, folder)}/curve.csv)",
+        f"{curve[-1].mean:.1f} at {curve[-1].environment_steps:,}{'' if 'seconds' in about else ', unfinished'}",
+        f"{statistics.mean(point.mean for point in curve):.1f}",
+        f"{curve[-1].seconds / 60:.0f}",
+        *(", ".join(dict.fromkeys(str(session[key]) for session in sessions)) for key in ("threads", processor, "commit")),
+        sessions[-1]["date"][:10],
+    ]
+
+
+def search_tables(folder: Path) -> Iterator[str]:
+    """
+    What the generations of a search found, its best losses, what ``aarl analyze`` shows, and the rankings of its matrices; of
+    a search with several seeds how well short runs rank losses.
+    """
+    study = load_study(open_storage(folder, create=False))
+    parts = ["candidates", "baselines", "cross-validation"]
+    if len(study.user_attrs[SETTINGS_KEY]["seeds"]) > 1:
+        report = runpy.run_path(str(ROOT / "benchmarks" / "fidelity.py"))["report"]
+        lines = "\n".join(line.rstrip() for line in report(folder).strip("\n").splitlines())
+        yield f"`python benchmarks/fidelity.py {folder.relative_to(ROOT).as_posix()}`:\n\n```text\n{lines}\n```"
+        yield core_hours(folder, parts[:1])
+        return
+    trials = analysis.analysed(analysis.trial_table(study.get_trials(deepcopy=False)))
+    yield from generation_tables(trials)
+    best = trials.nlargest(BEST, "score").to_dict("records")
+    rows = [(row["number"], row["generation"], row["operation"], f"{row['score']:.0f}", f"`{row['loss']}`") for row in best]
+    yield "## Best losses\n\n" + markdown([("trial", "generation", "operation", "score", "loss"), *rows])
+    found = analysis.summary(study.get_trials(deepcopy=False)).tables
+    for name, title in ANALYSES.items():
+        if name in found:
+            frame = found[name].head(N_IMPORTANCES) if name == "importances" else found[name]
+            yield f"## {title}\n\n{from_frame(analysis.readable(name, frame))}"
+    for part in parts[1:]:
+        if not (runs := stored_scores(folder / part)).empty:
+            ranked = ranking(runs)
+            shown = ranked.map("{:.1f}".format).assign(runs=ranked["runs"]).reset_index()
+            yield f"## {part.capitalize()}, AULC\n\n{from_frame(shown)}"
+    yield core_hours(folder, parts)
+
+
+def generation_tables(trials: pd.DataFrame) -> Iterator[str]:
+    """Scores of the generations, and how likely luck explains that evolved losses are better."""
+    evolved, random = trials[trials["operation"].isin(EVOLVED)], trials[trials["operation"] == "random"]
+    rows = []
+    for generation in [*sorted(trials["generation"].unique()), "all"]:
+        parts = [part if generation == "all" else part[part["generation"] == generation] for part in (trials, evolved, random)]
+        rows.append([generation, *(scores_text(part["score"].tolist()) for part in parts)])
+    yield "## Scores: mean ± its standard error (number, best)\n\n" + markdown(
+        [("generation", "all", "evolved", "random"), *rows]
+    )
+    scores, others = evolved["score"].tolist(), random["score"].tolist()
+    best = [f"{mean_of_best(values, DRAWN):.0f}" for values in (scores, others)]
+    yield (
+        f"The best of {DRAWN} evolved losses is {best[0]} on average, the best of {DRAWN} random ones {best[1]}; "
+        f"Mann-Whitney's p of all is {mannwhitneyu(scores, others).pvalue:.1g}."
+    )
+
+
+def scores_text(scores: list[float]) -> str:
+    """Mean, standard error, number and best of scores."""
+    if len(scores) < 2:
+        return ", ".join(f"{score:.0f}" for score in scores)
+    error = statistics.stdev(scores) / math.sqrt(len(scores))
+    return f"{statistics.mean(scores):.0f} ± {error:.0f} ({len(scores)}, {max(scores):.0f})"
+
+
+def mean_of_best(scores: list[float], n: int) -> float:
+    """The expectation of the best of n scores that are drawn without replacement."""
+    ways = (math.comb(rank, n - 1) for rank in range(len(scores)))
+    return sum(score * way for score, way in zip(sorted(scores), ways, strict=True)) / math.comb(len(scores), n)
+
+
+def core_hours(folder: Path, parts: Iterable[str]) -> str:
+    """The finished runs of a search, and the hours of one core that they took."""
+    rows = []
+    for part in parts:
+        abouts = [read_about(path.parent) for path in (folder / part).rglob("curve.csv")]
+        hours = [about["seconds"] * about["sessions"][-1]["threads"] / 3600 for about in abouts if "seconds" in about]
+        rows.append((part, len(hours), f"{math.fsum(hours):.1f}"))
+    return "## Cost\n\n" + markdown([("part", "runs", "core hours"), *rows])
+
+
+def from_terminal(shown: Table) -> str:
+    """A table of ``aarl`` as Markdown."""
+    heads = [str(column.header).replace("\n", "<br>") for column in shown.columns]
+    cells = zip(*(column.cells for column in shown.columns), strict=True)
+    return markdown([[Text.from_markup(str(cell)).plain for cell in row] for row in [heads, *cells]])
+
+
+def from_frame(frame: pd.DataFrame) -> str:
+    """A table of texts as Markdown; losses stand in backticks."""
+    rows = [[f"`{cell}`" if "->" in str(cell) else cell for cell in row] for row in frame.itertuples(index=False)]
+    return markdown([list(frame.columns), *rows])
+
+
+def markdown(rows: Iterable[Iterable[Any]]) -> str:
+    """A table whose first row is its head."""
+    head, *others = (f"| {' | '.join(map(str, row))} |" for row in rows)
+    return "\n".join([head, re.sub(r"[^|]+", "---", head), *others])
+
+
+if __name__ == "__main__":
+    for path, text in texts().items():
+        path.write_text(text, encoding="utf-8")
