@@ -329,7 +329,7 @@ def test_baselines(folder: Path, executor: Planted) -> None:
     executor.fails = lambda run: run.aux_loss is not None and "[" in run.aux_loss and run.seed == 1
     output = run("baselines", "small.yml", code=1)
     # Two seeds: scores 1 and 2.
-    assert re.search(r"SAC\W+1\.500\W+1\.500\W+0\.707\W+2 ", output)
+    assert re.search(r"SAC\W+1\.500 .* 1\.000\W+2 ", output)
     assert output.splitlines()[-1] == "Failed: CURL on Pendulum-v1, seed 1: it burst"
     assert len(read_curve(Path("runs/small/baselines/SAC/Pendulum-v1/seed-1/curve.csv"))) == 2
 

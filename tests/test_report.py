@@ -168,7 +168,7 @@ def plant(folder, variant, environment, seed, score):
 
 
 def test_baselines_and_cross_validation_are_read_from_their_folders(tmp_path):
-    """Of the cross-validation, the candidates that have all runs are ranked."""
+    """Of the cross-validation, the candidates of which no run failed are ranked."""
     losses = ["{s_t} -> {s_t+1}", "{s_t} -> {r_t}", "{s_t} -> {a_t}"]
     runs = [
         (loss, f"dm_control/{env}-v0", seed, 10.0 * i + seed)
@@ -178,20 +178,24 @@ def test_baselines_and_cross_validation_are_read_from_their_folders(tmp_path):
     ]
     for *cell, score in runs:
         plant(tmp_path / "cross-validation", *cell, None if (*cell, score) == runs[-1] else score)
+    failed = cell_folder(tmp_path / "cross-validation", Cell(*cell))
+    (failed / "failed.json").write_text('{"reason": "it burst", "retry": false}')
     for seed, score in ((0, 3.0), (1, 4.0), (2, None)):
         plant(tmp_path / "baselines", "SAC", "a", seed, score)
     assert stored_baselines(tmp_path) == [("SAC", 3.5)] and stored_baselines(tmp_path / "nothing") == []
     validation = stored_scores(tmp_path / "cross-validation")
-    assert sorted(validation[["variant", "environment", "seed", "score"]].itertuples(index=False, name=None)) == sorted(
-        runs[:-1]
-    )
+    found = validation.dropna()[["variant", "environment", "seed", "score"]].itertuples(index=False, name=None)
+    assert sorted(found) == sorted(runs[:-1])
     study = optuna.create_study()
     write_report(study, tmp_path / "report.html", validation=validation)
     page = read_page(tmp_path / "report.html")
     rows = table_after(page, "Cross-validation")
     assert [row[0].endswith(loss) for row, loss in zip(rows, losses[1::-1], strict=True)] == [True, True]
-    assert [row[1:] for row in rows] == [["10.5", "10.5", "10.5", "0.7", "4"], ["0.5", "0.5", "0.5", "0.7", "4"]]
-    assert "1 without all runs are left out." in " ".join(page.text_content().split())
+    assert [(*row[1:3], row[-1]) for row in rows] == [("10.5", "10.5", "4"), ("0.5", "0.5", "4")]
+    for (mean, low, high), truth in zip([map(float, row[3:6]) for row in rows], (10.5, 0.5), strict=True):
+        assert low < truth < high and abs(mean - truth) < 1
+    assert float(rows[0][6]) + float(rows[1][6]) == pytest.approx(1)
+    assert "1 with runs that failed, or without all environments, are left out." in " ".join(page.text_content().split())
     write_report(study, tmp_path / "report.html", validation=stored_scores(tmp_path / "nothing"))
     assert "Cross-validation" not in read_page(tmp_path / "report.html").text_content()
 

@@ -1,5 +1,6 @@
 """The paper's procedures: the study of a search, its runs, baselines, cross-validation, operators."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ from executors import Planted
 from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
 from optuna.storages import InMemoryStorage
 from optuna.trial import create_trial
+from sb3_aarl.search.evolution.racing import standings
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import distributions, loss_of, loss_to_params, random_loss
 from sb3_aarl.search.evolution.surrogate import features
 from sb3_aarl.search.execution.driver import SearchProgress
-from sb3_aarl.search.execution.matrix import Cell, run_matrix
+from sb3_aarl.search.execution.matrix import Cell, run_matrix, scores
 from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.config import SearchConfig, load_config
@@ -278,12 +280,42 @@ def test_finalists_that_the_surrogate_rates_highest() -> None:
     assert cross_validation.top_losses(study, 4, 3) == [losses[i] for i in (*by_score[:4], *others[:3])]
 
 
-def test_a_ranking_deviates_over_seeds_not_over_environments(tmp_path: Path) -> None:
+def test_a_ranking_is_of_the_means_over_environments_with_intervals(tmp_path: Path) -> None:
     rows = [(str(LOSSES[0]), *cell) for cell in [("x", 0, 99.0), ("x", 1, 101.0), ("y", 0, 899.0), ("y", 1, 905.0)]]
     rows += [(str(LOSSES[1]), environment, seed, 0.0) for _, environment, seed, _ in rows]
+    rows += [("failed", "x", 0, 999.0), ("failed", "y", 0, math.nan), ("one environment", "x", 0, 999.0)]
     table = cross_validation.ranking(pd.DataFrame(rows, columns=["variant", "environment", "seed", "score"]))
-    row = table.iloc[0]
-    assert (row["x"], row["y"], row["mean"], row["runs"]) == (100.0, 902.0, 501.0, 4)
-    assert row["std"] == pytest.approx(np.std([499.0, 503.0], ddof=1))
+    assert list(table.index) == [str(loss) for loss in LOSSES[:2]]
+    row, expected = table.iloc[0], standings(np.array([[0.0, 0.0], [499.0, 503.0]]))
+    assert (row["x"], row["y"], row["runs"]) == (100.0, 902.0, 4)
+    assert [row[name] for name in expected._fields] == [values[1] for values in expected]
     assert cross_validation.write_winner(table, tmp_path / "winner.yml") == LOSSES[0]
     assert catalog.resolve(tmp_path / "winner.yml") == LOSSES[0]
+
+
+def test_new_seeds_go_to_those_that_could_still_be_the_best(config: SearchConfig, tmp_path: Path, executor: Planted) -> None:
+    losses = [AuxLoss.parse(text) for text in ("{s_t} -> {s_t+1}", "{s_t, a_t} -> {r_t}", "{s_t} -> {r_t}", "{s_t} -> {a_t}")]
+    study = Search(config, storage=InMemoryStorage()).study
+    for loss in losses:
+        study.add_trial(create_trial(params=loss_to_params(loss), distributions=distributions(loss.horizon, 3), value=1.0))
+    executor.scores = dict(zip(map(str, losses), (100.0, 101.0, 0.0, 999.0), strict=True))
+    executor.fails = lambda run: run.aux_loss == str(losses[3]) and run.environment != "Pendulum-v1"
+    section = {"environments": ["Pendulum-v1", "MountainCarContinuous-v0"], "seeds": [1, 2], "top": 4, "budget": 14}
+    raced = load_config(config.path, cross_validation=section)
+    matrix = cross_validation.make_matrix(raced, study, tmp_path, baselines=config.baselines[:1])
+    for part in cross_validation.rounds(raced, matrix):
+        list(run_matrix(part, executor))
+        if len(executor.runs) > 25:  # it is killed, and started again
+            break
+    for part in cross_validation.rounds(raced, matrix):
+        list(run_matrix(part, executor))
+    table = cross_validation.ranking(scores(matrix))
+    # Both seeds on both environments; the rest of the budget, which is two environments each, is of the best two.
+    runs = table["runs"].to_dict()
+    assert runs[str(losses[2])] == runs["CURL"] == 4 and str(losses[3]) not in runs
+    assert runs[str(losses[0])] > 6 and runs[str(losses[1])] > 6
+    assert sum(runs.values()) - runs["CURL"] == 2 * 14
+    assert table["p_best"].nlargest(2).sum() > 0.99
+    with pytest.raises(ConfigError, match=r"cross_validation.budget: must be at least 8, .*not 7"):
+        load_config(config.path, cross_validation={**section, "budget": 7})
+    assert len(cross_validation.all_runs(raced)) == 2 * 14 + 2 * 2 * 2

@@ -1,6 +1,5 @@
 """Commands that train a matrix of runs and show its tables: baselines, cross-validation, benchmark."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,17 +42,15 @@ def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
     return kinds
 
 
-def compare(
-    matrix: "Matrix", table: "Callable[[pd.DataFrame], pd.DataFrame]", title: str, json: bool
-) -> "pd.DataFrame | None":
-    """Show a table of the variants that can be compared, and return it."""
-    from sb3_aarl.search.execution.matrix import comparable, scores, task_name
+def compare(matrix: "Matrix", title: str, json: bool) -> "pd.DataFrame":
+    """Show the ranking of the variants that can be compared, and return it."""
+    from sb3_aarl.search.execution.matrix import scores, task_name
+    from sb3_aarl.search.studies.cross_validation import ranking
 
-    compared = comparable(scores(matrix))
-    ranked = None if compared.empty else table(compared)
+    ranked = ranking(scores(matrix))
     if json:
-        say_json([] if ranked is None else records(ranked))
-    elif ranked is not None:
+        say_json(records(ranked))
+    elif not ranked.empty:
         shown = ranked.map("{:.3f}".format).replace("nan", "-").assign(runs=ranked["runs"].map(str))
         show_table(shown.rename(columns=task_name).reset_index(), title)
     return ranked
@@ -80,7 +77,6 @@ def baselines(
     """Train the baselines of a search, which its candidates are compared with."""
     from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
     from sb3_aarl.search.studies import search
-    from sb3_aarl.search.studies.cross_validation import ranking
 
     found = search.Search.from_file(config, folder, threads=threads)
     settings = found.config
@@ -90,7 +86,7 @@ def baselines(
         search.check_study(load_study(open_storage(found.folder), settings.name), settings, free=("threads",))
     matrix = search.baselines(settings, found.folder)
     train_matrix(matrix, workers, settings.retries, config)
-    compare(matrix, ranking, "Baselines, AULC", json)
+    compare(matrix, "Baselines, AULC", json)
     exit_if_failed(matrix)
 
 
@@ -116,10 +112,11 @@ def cross_validate(
     settings, path = found.config, found.folder
     searched = load_study(open_storage(path, storage, create=False), settings.name)
     matrix = cross_validation.make_matrix(settings, searched, path, top, settings.baselines if with_baselines else ())
-    train_matrix(matrix, workers, settings.retries, config)
-    table = compare(matrix, cross_validation.ranking, "Cross-validation, AULC", json)
+    for part in cross_validation.rounds(settings, matrix):
+        train_matrix(part, workers, settings.retries, config)
+    table = compare(matrix, "Cross-validation, AULC: posterior mean, 95 % interval, probability to be the best", json)
     names = [baseline.name for baseline in settings.baselines]
-    if table is not None and not (candidates := table.drop(index=names, errors="ignore")).empty:
+    if not (candidates := table.drop(index=names, errors="ignore")).empty:
         winner = cross_validation.write_winner(candidates, path / "winner.yml")
         if not json:
             say(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}")

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.queue import Queue, pace, seconds_to_go
-from sb3_aarl.search.training.folder import FAILED, Run, is_finished, partial_curve, prepare_run
+from sb3_aarl.search.training.folder import FAILED, Run, is_finished, partial_curve, prepare_run, read_outcome
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
 from sb3_aarl.search.training.setup import check_run
 
@@ -137,8 +138,8 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
 
 def scores(matrix: Matrix) -> pd.DataFrame:
     """
-    The finished runs: one row each with ``variant``, ``environment``, ``seed``, ``score`` (AULC, on the scale of ``returns``
-    where ``provenance.json`` has them) and ``last`` (mean return at the last checkpoint).
+    The runs that are over: one row each with ``variant``, ``environment``, ``seed``, ``score`` (AULC, on the scale of
+    ``returns`` where ``provenance.json`` has them) and ``last`` (mean return at the last checkpoint); NaN where a run failed.
     """
     return _scores((cell, cell_folder(matrix.folder, cell)) for cell in matrix.runs)
 
@@ -150,8 +151,14 @@ def stored_scores(folder: Path) -> pd.DataFrame:
 
 
 def _scores(runs: Iterable[tuple[Cell, Path]]) -> pd.DataFrame:
-    found = [(cell, partial_curve(path), read_about(path).get("returns")) for cell, path in runs if is_finished(path)]
-    rows = [(*cell, scaled(aulc(curve), returns), curve[-1].mean) for cell, curve, returns in found]
+    rows: list[tuple[Any, ...]] = []
+    for cell, path in runs:
+        outcome = read_outcome(path) if path.exists() else None
+        if outcome is not None and outcome.failure is None:
+            score = scaled(aulc(outcome.curve), read_about(path).get("returns"))
+            rows.append((*cell, score, outcome.curve[-1].mean))
+        elif outcome is not None:
+            rows.append((*cell, math.nan, math.nan))
     return pd.DataFrame(rows, columns=[*Cell._fields, "score", "last"])
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from optuna import Study
-from sb3_aarl.search.execution.matrix import comparable, stored_scores, task_name
+from sb3_aarl.search.execution.matrix import stored_scores, task_name
 from sb3_aarl.search.results import analysis
 from sb3_aarl.search.results.plots import evolution_plot, learning_curves_plot, patterns_plot
 from sb3_aarl.search.studies import cross_validation
@@ -92,11 +92,10 @@ def _candidates(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _validation(runs: pd.DataFrame | None) -> dict[str, Any] | None:
-    """The ranking of the candidates that have all runs, and how many are left out."""
-    if runs is None or comparable(runs).empty:
+    """The ranking of the candidates, and how many are left out."""
+    if runs is None or (ranking := cross_validation.ranking(runs)).empty:
         return None
-    ranking = cross_validation.ranking(comparable(runs))
-    text = ranking.map("{:.1f}".format).replace("nan", "-").assign(runs=ranking["runs"].map("{:.0f}".format))
+    text = ranking.map("{:.4g}".format).replace("nan", "-").assign(runs=ranking["runs"].map("{:.0f}".format))
     text = text.rename(columns=task_name)
     losses = [Markup("<code>{}</code>").format(name) if "->" in name else f"Baseline: {name}" for name in ranking.index]
     text.insert(0, "Loss", losses)

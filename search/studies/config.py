@@ -102,7 +102,9 @@ class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     Cross-validation of the ``top`` candidates of a search (paper, A.4), and of ``top_rated`` others that the surrogate of
     ``screening`` rates highest: a score of one seed is noisy. Without ``environments``, they are the search's. ``checkpoints``
     are the environment steps of the evaluations on each environment, where they differ from the search's. ``returns`` are
-    those that count as 0 and 1 on environments that a search over several does not have.
+    those that count as 0 and 1 on environments that a search over several does not have. With a ``budget``, candidates race:
+    ``seeds`` are those that each one gets; others follow for those that could still be the best, until the budget is spent,
+    in which a seed on all environments counts as one.
     """
 
     environments: Environments = ()
@@ -111,6 +113,16 @@ class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     top_rated: NonNegativeInt = 0
     checkpoints: dict[Environment, Checkpoints] = {}
     returns: dict[Environment, Returns] = {}
+    budget: PositiveInt | None = None
+
+    @field_validator("budget")
+    @classmethod
+    def _is_enough(cls, budget: int | None, info: ValidationInfo) -> int | None:
+        if budget is not None and {"top", "top_rated", "seeds"} <= info.data.keys():
+            least = (info.data["top"] + info.data["top_rated"]) * len(info.data["seeds"])
+            if budget < least:
+                raise ValueError(f"must be at least {least}, for the seeds of all candidates, not {budget}")
+        return budget
 
 
 class Baseline(BaseModel, frozen=True, extra="forbid"):

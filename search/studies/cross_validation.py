@@ -1,7 +1,7 @@
 """Cross-validation of a search's best candidates (paper, A.4): the best on one environment may have overfitted to it."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -10,13 +10,14 @@ import optuna
 import pandas as pd
 import yaml
 from optuna.study import StudyDirection
+from sb3_aarl.search.evolution.racing import next_runs, standings
 from sb3_aarl.search.evolution.surrogate import TokenModel
-from sb3_aarl.search.execution.matrix import Cell, Matrix
+from sb3_aarl.search.execution.matrix import Cell, Matrix, cell_folder, scores
 from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
 from sb3_aarl.search.studies.search import check_study, search_matrix
 from sb3_aarl.search.training.config import ConfigError
-from sb3_aarl.search.training.folder import Run
+from sb3_aarl.search.training.folder import Run, is_finished
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
@@ -59,14 +60,50 @@ def make_matrix(
             )
     losses = top_losses(study, section.top, section.top_rated) if top is None else top_losses(study, top)
     candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
-    return _make_matrix(config, folder, [*candidates, *baselines])
+    n_more = section.budget - len(section.seeds) if section.budget else 0
+    following = max(section.seeds) + 1
+    more = dict.fromkeys(range(following, following + n_more), candidates)
+    return _make_matrix(config, folder, {seed: [*candidates, *baselines] for seed in section.seeds} | more)
+
+
+def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
+    """
+    The parts of a matrix, each of which is to be trained before the next one is asked for: all of it or, with a budget, the
+    rounds of a race, which a loss leaves when a run of it fails.
+    """
+    section, baselines = _section(config), {baseline.name for baseline in config.baselines}
+    if section.budget is None:
+        yield matrix
+        return
+    names = list(dict.fromkeys(cell.variant for cell in matrix.runs if cell.variant not in baselines))
+    environments, seeds = ({cell[i]: None for cell in matrix.runs} for i in (1, 2))
+    waiting, failed = {cell for cell in matrix.runs if cell.variant in baselines}, set[str]()
+    while True:
+        racing = [name for name in names if name not in failed]
+        table = seed_scores(scores(matrix), len(environments)).reindex(index=names, columns=list(seeds))
+        spent = int(table.loc[sorted(failed)].count().sum())
+        found = next_runs(table.loc[racing].to_numpy(), section.budget - spent, len(section.seeds))
+        chosen = {(racing[row], list(seeds)[column]) for row, column in found}
+        cells = [cell for cell in matrix.runs if (cell.variant, cell.seed) in chosen or cell in waiting]
+        if not cells:
+            return
+        yield replace(matrix, runs={cell: matrix.runs[cell] for cell in cells})
+        waiting.clear()
+        failed |= {cell.variant for cell in cells if not is_finished(cell_folder(matrix.folder, cell))} - baselines
 
 
 def all_runs(config: SearchConfig) -> Mapping[Cell, Run]:
     """Baselines, and candidates that are not known yet, each with AARL-State: what a cross-validation would cost."""
     loss, section = catalog.load("aarl-state"), _section(config)
-    candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(section.top + section.top_rated)]
-    return _make_matrix(config, Path(), [*candidates, *config.baselines]).runs
+    n_candidates = section.top + section.top_rated
+    if section.budget is None:
+        candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(n_candidates)]
+        return _make_matrix(config, Path(), {seed: [*candidates, *config.baselines] for seed in section.seeds}).runs
+    # As many runs, whichever candidates get them.
+    any_candidate, seeds = Baseline(name="candidates", aux_loss=loss), range(section.budget)
+    candidates_alone = _make_matrix(config, Path(), {seed: [any_candidate] for seed in seeds})
+    others = _make_matrix(config, Path(), dict.fromkeys(section.seeds, config.baselines))
+    return {**candidates_alone.runs, **others.runs}
 
 
 def _section(config: SearchConfig) -> CrossValidation:
@@ -75,11 +112,16 @@ def _section(config: SearchConfig) -> CrossValidation:
     return config.cross_validation
 
 
-def _make_matrix(config: SearchConfig, folder: Path, variants: Sequence[Baseline]) -> Matrix:
+def _make_matrix(config: SearchConfig, folder: Path, variants: Mapping[int, Sequence[Baseline]]) -> Matrix:
+    """The matrix of variants by seed."""
     section = _section(config)
-    by_name = {variant.name: variant for variant in variants}
+    by_name = {variant.name: variant for of_seed in variants.values() for variant in of_seed}
     environments = section.environments or tuple(config.tasks)
-    cells = [Cell(name, environment, seed) for seed, environment, name in product(section.seeds, environments, by_name)]
+    cells = [
+        Cell(variant.name, environment, seed)
+        for seed, of_seed in variants.items()
+        for environment, variant in product(environments, of_seed)
+    ]
     matrix = search_matrix(config, f"{config.name}-cross-validation", folder / "cross-validation", cells, by_name)
     # On the search's environments, runs may be longer than those of its candidates.
     checkpoints = {environment: {"checkpoints": steps} for environment, steps in section.checkpoints.items()}
@@ -87,17 +129,27 @@ def _make_matrix(config: SearchConfig, folder: Path, variants: Sequence[Baseline
     return replace(matrix, runs=runs)
 
 
+def seed_scores(runs: pd.DataFrame, n_environments: int) -> pd.DataFrame:
+    """The mean score over all environments of each variant (row) and seed (column), NaN where it lacks one of them."""
+    groups = runs.groupby(["variant", "seed"])["score"]
+    return groups.mean().where(groups.count() == n_environments).unstack()
+
+
 def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     """
-    The candidates by their mean AULC over all environments (paper, A.4), the best first; ``std`` is the sample deviation over
-    seeds of the mean over environments.
+    The candidates, the best first, by what their runs say of the mean score over all seeds and environments (paper, A.4):
+    ``mean`` with its 95 % interval from ``low`` to ``high``, ``p_best``, the probability that a candidate is the best of them,
+    and ``runs``, beside the mean scores on each environment. Candidates of which a run failed are left out; an environment on
+    which no run is finished does not count.
     """
+    runs = runs[runs.groupby("environment")["score"].transform("count") > 0]
+    failed = runs.loc[runs["score"].isna(), "variant"]
+    runs = runs[~runs["variant"].isin(failed)]
+    by_seed = seed_scores(runs, runs["environment"].nunique())
     by_environment = runs.pivot_table(index="variant", columns="environment", values="score", aggfunc="mean")
-    by_seed = runs.groupby(["variant", "seed"])["score"].mean().groupby("variant")
-    # The mean of the environments' means: each counts alike, however many seeds it has so far.
-    overall = pd.DataFrame({"mean": by_environment.mean(axis=1), "std": by_seed.std()})
+    overall = pd.DataFrame(standings(by_seed.to_numpy())._asdict(), index=by_seed.index)
     overall["runs"] = runs.groupby("variant")["score"].count()
-    return by_environment.join(overall).sort_values("mean", ascending=False)
+    return by_environment.join(overall).dropna(subset="mean").sort_values("mean", ascending=False, kind="stable")
 
 
 def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
@@ -106,7 +158,8 @@ def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
     files take, and return it.
     """
     winner = AuxLoss.parse(str(table.index[0]))
-    mean, runs = table["mean"].iloc[0], table["runs"].iloc[0]
-    comment = f"# Best of {len(table)} candidates in cross-validation: mean score {mean:.3f}, runs: {runs}\n"
+    mean, runs, p_best = (table[name].iloc[0] for name in ("mean", "runs", "p_best"))
+    comment = f"# Best of {len(table)} candidates in cross-validation: mean score {mean:.3f}, runs: {runs}, "
+    comment += f"probability that it is the best of the table: {p_best:.2f}\n"
     replace_text(path, comment + yaml.safe_dump({"aux_loss": winner}, sort_keys=False))
     return winner
