@@ -14,6 +14,8 @@ The public reference implementation took 107 ms (state) and 1139 ms (pixels) on 
 """
 
 import argparse
+import functools
+import gc
 import statistics
 import time
 import traceback
@@ -45,7 +47,7 @@ WIDTH = {"small": 256, "state": 1024, "pixels": 1024, "pixels-512": 1024}
 TRANSITIONS = {"small": 20_000, "state": 20_000, "pixels": 2000, "pixels-512": 2000}
 REFERENCE_MS, REFERENCE_GFLOPS = {"state": 107, "pixels": 1139}, 220
 WAYS = ["", ", compiled", ", CUDA graphs"]
-BASE, GRAPHS = "SB3 SAC", WAYS[-1]
+GRAPHS = WAYS[-1]
 DENSE_MLP: dict[str, Any] = {"policy_kwargs": {"features_extractor_class": "dense_mlp"}}
 PARTS = ("sampling", "critic", "actor", "auxiliary", "targets")
 
@@ -221,22 +223,27 @@ def waits(model: SACAux) -> dict[str, int]:
         warnings.simplefilter("always")
         model.train(2, model.batch_size)
     th.cuda.set_sync_debug_mode("default")
-    found = [warning for warning in caught if "synchronizing" in str(warning.message)]
+    found = [warning for warning in caught if "called a synchronizing" in str(warning.message)]
     return dict(Counter(f"{Path(warning.filename).name}:{warning.lineno}" for warning in found))
 
 
 class Measured:
-    """A model that has made its first gradient steps, in which it allocates and compiles."""
+    """A model that has made its first gradient steps, in which it allocates and compiles; ``make`` makes it."""
 
-    def __init__(self, model: SAC, device: str, buffers: dict[Any, ReplayBuffer | None], seconds: float):
-        self.model, self.device = model, device
+    def __init__(self, make: Callable[[], SAC], device: str, buffers: dict[Any, ReplayBuffer | None], graphs: bool = False):
+        before = th.cuda.memory_allocated() if device == "cuda" else 0
+        model = self.model = make()
+        self.device = device
         kind = type(model), model.n_steps
         if kind not in buffers:
             fill(model, model.buffer_size)
             buffers[kind] = model.replay_buffer
         model.replay_buffer = buffers[kind]
         model.set_logger(configure(None, []))
-        before = th.cuda.memory_allocated() if device == "cuda" else 0
+        if graphs:
+            assert isinstance(model, SACAux)
+            model.train(2, model.batch_size)  # what is computed once and kept would split the graphs
+            use_cuda_graphs(model)
         if device == "cuda":
             th.cuda.reset_peak_memory_stats()
         started = time.perf_counter()
@@ -245,7 +252,6 @@ class Measured:
         self.first_seconds = time.perf_counter() - started
         self.memory_mb = (th.cuda.max_memory_allocated() - before) / 1e6 if device == "cuda" else None
         self.steps = 4
-        self.steps = max(2, round(seconds / self.seconds()))
 
     def seconds(self) -> float:
         """Of a gradient step, the mean of some; each in a call of train(), as in learn()."""
@@ -257,38 +263,44 @@ class Measured:
         return (time.perf_counter() - started) / self.steps
 
 
+def compare(base: Measured, measured: Measured, rounds: int, seconds: float) -> dict[str, Any]:
+    """The columns of a row; rounds of so many seconds take turns with the base's."""
+    model, device = measured.model, measured.device
+    for one in (base, measured):
+        one.steps = max(2, round(seconds / one.seconds()))
+    pairs = [(base.seconds(), measured.seconds()) for _ in range(rounds)]
+    ms = 1e3 * statistics.median(own for _, own in pairs)
+    row: dict[str, Any] = {
+        "ms": ms,
+        "steps_per_second": 1e3 / ms,
+        "ratio": statistics.median(own / theirs for theirs, own in pairs),
+        "memory_mb": measured.memory_mb,
+        "first_seconds": measured.first_seconds,
+        "rounds_ms": [1e3 * own for _, own in pairs],
+        "sb3_rounds_ms": [1e3 * theirs for theirs, _ in pairs],
+    }
+    if isinstance(model, SACAux):
+        row["parts_ms"] = parts(model, device, 2 * measured.steps)
+        if device == "cuda":
+            row["waits"] = waits(model)
+    return row
+
+
 def measure(
     setting: str, device: str, rows: dict[str, dict[str, Any]], rounds: int, seconds: float
 ) -> Iterator[dict[str, Any]]:
-    """SB3's SAC and each row, as soon as it is measured; a row that fails has the reason."""
+    """SB3's SAC and each row, as soon as it is measured; one that fails has the reason."""
     buffers: dict[Any, ReplayBuffer | None] = {}
-    base = Measured(sb3(setting, device), device, buffers, seconds)
-    compared = device == "cpu" and setting in REFERENCE_MS
-    reference = REFERENCE_MS[setting] * REFERENCE_GFLOPS / peak(setting) if compared else None
-    for name, kwargs in {BASE: {}, **rows}.items():
+    base = Measured(lambda: sb3(setting, device), device, buffers)
+    yield {"setting": setting, "algorithm": "SB3 SAC", **compare(base, base, rounds, seconds)}
+    for name, kwargs in rows.items():
         row: dict[str, Any] = {"setting": setting, "algorithm": name}
+        # The model before is gone, and another one is no reason to compile a function again.
+        gc.collect()
+        th.compiler.reset()
         try:
-            if name == BASE:
-                measured = base
-            else:
-                th.compiler.reset()  # another model is no reason to compile a function again
-                model = ours(setting, device, **kwargs)
-                if name.endswith(GRAPHS):
-                    use_cuda_graphs(model)
-                measured = Measured(model, device, buffers, seconds)
-            pairs = [(base.seconds(), measured.seconds()) for _ in range(rounds)]
-            row["ms"] = 1e3 * statistics.median(own for _, own in pairs)
-            row["steps_per_second"] = 1e3 / row["ms"]
-            row["ratio"] = statistics.median(own / theirs for theirs, own in pairs)
-            row["rounds_ms"] = [1e3 * own for _, own in pairs]
-            row["sb3_rounds_ms"] = [1e3 * theirs for theirs, _ in pairs]
-            row["memory_mb"], row["first_seconds"] = measured.memory_mb, measured.first_seconds
-            if reference is not None:
-                row["ratio_to_reference"] = row["ms"] / reference
-            if isinstance(measured.model, SACAux):
-                row["parts_ms"] = parts(measured.model, device, 2 * measured.steps)
-                if device == "cuda":
-                    row["waits"] = waits(measured.model)
+            make = functools.partial(ours, setting, device, **kwargs)
+            row |= compare(base, Measured(make, device, buffers, name.endswith(GRAPHS)), rounds, seconds)
         except Exception as error:  # the other rows are worth having
             traceback.print_exc()
             row["error"] = f"{type(error).__name__}: {error}".partition("\n")[0]
@@ -305,7 +317,7 @@ def line(row: dict[str, Any]) -> str:
     shares = " ".join(f"{split[part]:10.2f}" for part in PARTS) if split else " " * 54
     reference = f"{row['ratio_to_reference']:9.3f}" if "ratio_to_reference" in row else ""
     measured = f"{row['steps_per_second']:8.1f} {row['ms']:8.2f} {row['ratio']:6.3f} {memory} {row['first_seconds']:6.1f}"
-    return f"{start} {measured} {shares} {reference} {row.get('error', '')}".rstrip()
+    return f"{start} {measured} {shares} {reference}".rstrip()
 
 
 def main() -> None:
@@ -333,14 +345,16 @@ def main() -> None:
 
     for setting in args.settings:
         th.set_num_threads(1 if setting == "small" else threads)
-        chosen = {name: kwargs for name, kwargs in modes(setting, WAYS).items() if name in (args.rows or names)}
-        if args.rows:
-            chosen = {name: chosen[name] for name in args.rows if name in chosen}
-        skipped = [name for name in chosen if args.device == "cpu" and name.endswith(GRAPHS)]
-        for name in skipped:
+        all_rows = modes(setting, WAYS)
+        chosen = {name: all_rows[name] for name in args.rows or all_rows if name in all_rows}
+        for name in [name for name in chosen if args.device == "cpu" and name.endswith(GRAPHS)]:
+            del chosen[name]
             done({"setting": setting, "algorithm": name, "skipped": "needs a GPU"})
-        chosen = {name: kwargs for name, kwargs in chosen.items() if name not in skipped}
+        compared = args.device == "cpu" and setting in REFERENCE_MS and not args.batch_size
+        reference = REFERENCE_MS[setting] * REFERENCE_GFLOPS / peak(setting) if compared else None
         for row in measure(setting, args.device, chosen, args.rounds, args.seconds):
+            if reference is not None and "ms" in row:
+                row["ratio_to_reference"] = row["ms"] / reference
             done(row)
 
 
