@@ -22,7 +22,6 @@ from sb3_aarl.search.execution.matrix import stored_scores, task_name
 from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
 from sb3_aarl.search.results import analysis, table
 from sb3_aarl.search.studies.benchmark import read_abouts
-from sb3_aarl.search.studies.cross_validation import ranking
 from sb3_aarl.search.studies.search import SETTINGS_KEY
 from sb3_aarl.search.training.provenance import read_about
 from scipy.stats import mannwhitneyu
@@ -141,7 +140,7 @@ def search_tables(folder: Path) -> Iterator[str]:
             yield f"## {title}\n\n{from_frame(analysis.readable(name, frame))}"
     for part in parts[1:]:
         if not (runs := stored_scores(folder / part)).empty:
-            ranked = ranking(runs)
+            ranked = mean_scores(runs)
             shown = ranked.map("{:.1f}".format).assign(runs=ranked["runs"]).reset_index()
             yield f"## {part.capitalize()}, AULC\n\n{from_frame(shown)}"
     yield core_hours(folder, parts)
@@ -177,6 +176,14 @@ def mean_of_best(scores: list[float], n: int) -> float:
     """The expectation of the best of n scores that are drawn without replacement."""
     ways = (math.comb(rank, n - 1) for rank in range(len(scores)))
     return sum(score * way for score, way in zip(sorted(scores), ways, strict=True)) / math.comb(len(scores), n)
+
+
+def mean_scores(runs: pd.DataFrame) -> pd.DataFrame:
+    """Mean scores of variants on each environment and over all, the deviation over seeds, and the number of runs, best first."""
+    by_environment = runs.pivot_table(index="variant", columns="environment", values="score")
+    by_seed = runs.groupby(["variant", "seed"])["score"].mean().groupby("variant").agg(["mean", "std"])
+    result = by_environment.join(by_seed).assign(runs=runs.groupby("variant").size())
+    return result.sort_values("mean", ascending=False)
 
 
 def core_hours(folder: Path, parts: Iterable[str]) -> str:

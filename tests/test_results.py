@@ -19,7 +19,6 @@ from sb3_aarl.search.results.statistics import interquartile_means
 from sb3_aarl.search.results.table import paper_scores, read_runs
 from sb3_aarl.search.studies import benchmark
 from sb3_aarl.search.studies.benchmark import load_benchmark, read_experiment
-from sb3_aarl.search.studies.cross_validation import ranking
 from scipy.stats import mannwhitneyu
 from typer.testing import CliRunner
 
@@ -126,7 +125,7 @@ def test_a_search_found_what_its_texts_say() -> None:
     figures = [make_tables["scores_text"](scores.tolist()).partition(" (")[0] for scores in (evolved, random, given)]
     figures += [f"{len(trials)} candidates", f"{given.max():.0f}", f"AARL-State {baselines['AARL-State']:.0f}"]
     # What is confirmed is what the cross-validation ranks first, and the best evolved loss, its second.
-    ranked = ranking(stored_scores(folder / "cross-validation"))["mean"]
+    ranked = make_tables["mean_scores"](stored_scores(folder / "cross-validation"))["mean"]
     variants = read_experiment(RESULTS / "search/confirmation/variants.yml").variants
     assert [str(resolve(variants[f"{name}_simba"]["aux_loss"])) for name in ("published", "evolved")] == list(ranked.index[:2])
     figures += [f"{score:.0f}" for score in ranked[:2]]
