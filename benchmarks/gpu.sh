@@ -74,7 +74,7 @@ part eager 130 "${step[@]}" --settings $settings --out "$out/eager.json" \
 part tests 60 "$python" -m pytest -q -p no:cacheprovider tests/test_train_modes.py -k "gpu or cuda"
 part at_once 120 "$python" benchmarks/throughput.py --device $device --settings small pixels --modes bf16 \
     --processes $processes --seconds $at_once --out "$out/at_once.json"
-# A row takes one core half a minute to compile, and the result is kept on disk: all settings side by side, then each alone.
+# The compiler keeps its results on disk (on a busy CPU a row took 147 s, then 19): all settings side by side, then each alone.
 rows=("bf16, CUDA graphs" "fp32, CUDA graphs" "bf16, compiled" "fp32, compiled")
 part compile 150 bash -c 'settings=$1; shift; for setting in $settings; do "$@" --settings $setting & done; wait' - \
     "$compiled" "${step[@]}" --rounds 1 --seconds 0 --rows "${rows[@]}"
