@@ -179,7 +179,7 @@ def mean_of_best(scores: list[float], n: int) -> float:
 
 
 def mean_scores(runs: pd.DataFrame) -> pd.DataFrame:
-    """Mean scores of variants on each environment and over all, the deviation over seeds, and the number of runs, best first."""
+    """Mean scores of variants on each environment and over all, the deviation over seeds, the number of runs; best first."""
     by_environment = runs.pivot_table(index="variant", columns="environment", values="score")
     by_seed = runs.groupby(["variant", "seed"])["score"].mean().groupby("variant").agg(["mean", "std"])
     result = by_environment.join(by_seed).assign(runs=runs.groupby("variant").size())

@@ -4,6 +4,7 @@ import copy
 import functools
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,9 @@ def tasks_of(variant: str) -> tuple[str, ...]:
 
 def test_the_variants_are_all_there() -> None:
     assert {path.stem for path in (ZOO / "paper").glob("*.yml")} == {*VARIANTS, "operators"}
+    readme = (ZOO / "README.md").read_text(encoding="utf-8")
+    assert all(path.name in readme or path.stem.endswith("-small") for path in ZOO.rglob("*.yml"))
+    assert all((ZOO / link).exists() for link in re.findall(r"\]\((.*?)\)", readme))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
