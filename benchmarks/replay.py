@@ -63,15 +63,14 @@ def main() -> None:
     memory = {"SB3": fill(theirs, args.transitions), "windows, cropped": fill(ours, args.transitions)}
     draws: dict[str, Callable[[], Any]] = {
         "SB3": lambda: theirs.sample(BATCH * (HORIZON + 1) // 2),
-        "windows, cropped": lambda: ours.sample_windows(BATCH, HORIZON),
+        "windows, cropped": lambda: ours.sample_windows(BATCH, HORIZON, crop_size=CROP),
         "windows, whole": lambda: ours.sample_windows(BATCH, HORIZON),
-        "transitions, cropped": lambda: ours.sample(BATCH * (HORIZON + 1) // 2),
+        "transitions, cropped": lambda: ours.sample(BATCH * (HORIZON + 1) // 2, crop_size=CROP),
     }
 
     seconds: dict[str, list[float]] = {name: [] for name in draws}
     for i in range(args.rounds + 1):
         for name, draw in draws.items():
-            ours.crop_size = CROP if "cropped" in name else None
             started = time.perf_counter()
             draw()
             if args.device != "cpu":

@@ -95,14 +95,13 @@ def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int 
     sizes = {key: box.shape[1:] for key, box in image_spaces(space, normalized_image).items()}
     if not sizes:
         return "none"
-    needs_crop = augmentation == "random_crop" or (augmentation == "auto" and crop_size is not None)
+    if augmentation == "auto":
+        augmentation = "random_shift" if crop_size is None else "random_crop"
     crop_size = CROP_SIZE if crop_size is None else crop_size
     for key, size in sizes.items():
-        if needs_crop and min(size) < crop_size:
+        if augmentation == "random_crop" and min(size) < crop_size:
             raise ValueError(
                 f"images{f' under {key!r}' if key else ''} of {size[0]} x {size[1]} pixels are smaller than the crop of "
-                f"{crop_size} x {crop_size}: render them larger, or ask for augmentation='random_shift'"
+                f"{crop_size} x {crop_size}: render them larger, or pass augmentation='random_shift'"
             )
-    if augmentation == "auto":
-        return "random_crop" if min(map(min, sizes.values())) > crop_size else "random_shift"
     return augmentation

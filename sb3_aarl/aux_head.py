@@ -21,7 +21,6 @@ class AuxHead(nn.Module):
     :param latent_dim: Width of a latent state
     :param action_dim: Width of an action
     :param predictor_width: Hidden units of the predictor, None for twice its input
-    :param predictor_batch_norm: Whether batch norm follows the hidden layer
     """
 
     def __init__(
@@ -30,7 +29,6 @@ class AuxHead(nn.Module):
         latent_dim: int,
         action_dim: int,
         predictor_width: int | None = 256,
-        predictor_batch_norm: bool = False,
     ):
         super().__init__()
         self.loss = loss
@@ -39,9 +37,7 @@ class AuxHead(nn.Module):
             sum(width[token.kind] for token in tokens) for tokens in (loss.source_tokens, loss.target_tokens)
         )
         hidden = 2 * source_dim if predictor_width is None else predictor_width
-        layers: list[nn.Module] = [nn.Linear(source_dim, hidden)]
-        layers += [nn.BatchNorm1d(hidden)] if predictor_batch_norm else []
-        self.predictor = nn.Sequential(*layers, nn.ReLU(), nn.Linear(hidden, target_dim))
+        self.predictor = nn.Sequential(nn.Linear(source_dim, hidden), nn.ReLU(), nn.Linear(hidden, target_dim))
         self.operator = Operator(loss.operator, loss.negatives, target_dim)
         # The observations of a window, for WindowReplayBuffer.sample_windows: first the source's, then the target's. One
         # that both name is there twice, so that images are augmented twice.

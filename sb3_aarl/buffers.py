@@ -82,9 +82,6 @@ class WindowReplayBuffer(ReplayBuffer):
         the first frame may be repeated (Gymnasium's FrameStackObservation) or zeros may fill up (SB3's VecFrameStack)
     """
 
-    # Height and width in pixels that images are cropped to at random while their frames are gathered, each observation at a
-    # position of its own, also one that a window has twice; None for no crop.
-    crop_size: int | None = None
     # Whether ``frame_stack`` is only what the wrappers suggest: where it does not hold, ``add`` warns and stores whole
     # observations from then on, instead of raising an error.
     frame_stack_detected = False
@@ -310,15 +307,27 @@ class WindowReplayBuffer(ReplayBuffer):
         self._episode_over = np.array(state["episode_over"])
         self._truncate(~self._episode_over)
 
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None, crop_size: int | None = None
+    ) -> ReplayBufferSamples | DictReplayBufferSamples:
+        """
+        As in SB3.
+
+        :param crop_size: Height and width in pixels that images are cropped to while their frames are gathered, each
+            observation at a random position of its own; None for no crop
+        """
+        crop = {} if crop_size is None else {"crop_size": crop_size}  # derived classes may have SB3's arguments alone
+        return self._get_samples(np.random.randint(0, self.size(), size=batch_size), env, **crop)
+
     def _get_samples(  # type: ignore[override]
-        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None, crop_size: int | None = None
     ) -> ReplayBufferSamples | DictReplayBufferSamples:
         indices = batch_inds * self.n_envs + np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
         last, rewards, discounts = indices, self._normalize_reward(self._take("rewards", indices)[:, None], env), None
         if self.n_steps > 1:
             last, rewards, discounts = self._n_step_returns(indices, env)
         # Observations and next ones together.
-        both = self.gather(np.stack([indices, last]), np.array([[False], [True]]), env, self.crop_size)
+        both = self.gather(np.stack([indices, last]), np.array([[False], [True]]), env, crop_size)
         dones = self._take("dones", last) * (1 - self._take("timeouts", last))
         return (DictReplayBufferSamples if isinstance(both, dict) else ReplayBufferSamples)(
             map_parts(lambda part: part[0].to(self.device), both),
@@ -381,6 +390,7 @@ class WindowReplayBuffer(ReplayBuffer):
         horizon: int,
         env: VecNormalize | None = None,
         offsets: Sequence[int] | None = None,
+        crop_size: int | None = None,
     ) -> WindowSamples:
         """
         Windows of consecutive steps inside one episode of one env, uniform over all whole ones in the buffer.
@@ -390,6 +400,7 @@ class WindowReplayBuffer(ReplayBuffer):
         :param env: VecNormalize that observations and rewards go through
         :param offsets: Gather only the observations at these offsets from the start (0 to k), in this order; None for all
             k + 1
+        :param crop_size: As for ``sample``; an observation that is there twice is cropped twice
         :raises NoWindowError: when no episode is long enough yet
         """
         if horizon < 1:
@@ -402,7 +413,7 @@ class WindowReplayBuffer(ReplayBuffer):
         # The last observation is the next one of the last step: the episode may have ended there.
         following = wanted == horizon
         # Gathered one offset after the other, so that all observations at some of the offsets are contiguous.
-        observations = self.gather(steps[:, wanted - following].T, following[:, None], env, self.crop_size)
+        observations = self.gather(steps[:, wanted - following].T, following[:, None], env, crop_size)
         return WindowSamples(
             map_parts(lambda part: part.transpose(0, 1).to(self.device), observations),
             self.to_torch(self._take("actions", steps), copy=False),

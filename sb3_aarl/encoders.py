@@ -163,7 +163,8 @@ class RunningNorm(nn.Module):
                 variance = x.var(dim=0, unbiased=False)
                 self.running_var.lerp_(variance + (1 - weight) * difference**2, weight)
                 self.running_mean += weight * difference
-        return (x - self.running_mean) / (self.running_var + 1e-5).sqrt()
+        # Clipped as VecNormalize does: a number that was constant so far may be far off when it changes.
+        return ((x - self.running_mean) / (self.running_var + 1e-5).sqrt()).clamp(-10, 10)
 
 
 class SimbaEncoder(Encoder):

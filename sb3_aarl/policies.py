@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Callable, Collection
 from functools import cached_property
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -69,14 +69,26 @@ def map_images(obs: PyTorchObs, image_keys: Collection[str], function: Callable[
     return function(obs) if image_keys else obs
 
 
-def has_parts(features_extractor: BaseFeaturesExtractor) -> TypeGuard[Encoder]:
-    """Whether an encoder is a trunk and a projection, one after the other, and nothing else: no ``forward`` of its own."""
-    return isinstance(features_extractor, Encoder) and type(features_extractor).forward is Encoder.forward
+def parts(encoder: BaseFeaturesExtractor) -> tuple[Callable[[Any], th.Tensor], Callable[[th.Tensor], th.Tensor]]:
+    """An encoder's trunk, which actor and critic both read, and its projection; one without a projection is all trunk."""
+    if isinstance(encoder, Encoder) and type(encoder).forward is Encoder.forward:
+        return encoder.trunk, encoder.project
+    return encoder, nn.Identity()
 
 
-def read_trunk(features_extractor: BaseFeaturesExtractor, obs: Any) -> th.Tensor:
-    """What actor and critic both read of a shared encoder: all but its projection, if it has one."""
-    return features_extractor.trunk(obs) if has_parts(features_extractor) else features_extractor(obs)
+def _image_advice(space: spaces.Space) -> str:
+    shape = getattr(space, "shape", None) or ()
+    if len(shape) == 2:
+        return "An image has three dimensions: add a channel to it, such as GrayscaleObservation(env, keep_dim=True)"
+    if len(shape) > 3:
+        return (
+            "An image has three dimensions: stack RGB images with SB3's VecFrameStack, which stacks their channels, and grey "
+            "ones without a channel with FrameStackObservation"
+        )
+    return (
+        "Bytes have to be in a Box from 0 to 255. Images that are floats already, such as VecNormalize's, have to be channel "
+        "first and need policy_kwargs=dict(normalize_images=False)"
+    )
 
 
 class Trunk(NamedTuple):
@@ -85,12 +97,36 @@ class Trunk(NamedTuple):
     values: th.Tensor
 
 
+class DetachedEncoder(BaseFeaturesExtractor):
+    """
+    The actor's features extractor: the critic's encoder without gradient, then a projection of the actor's own.
+
+    The projection (linear, layer norm) follows the encoder's trunk; an encoder that learns nothing, such as SB3's
+    FlattenExtractor, is read as it is.
+
+    :param encoder: The critic's encoder
+    """
+
+    def __init__(self, encoder: BaseFeaturesExtractor):
+        super().__init__(encoder._observation_space, encoder.features_dim)
+        self.encoder = encoder
+        self.projection: nn.Module = nn.Identity()
+        if parts(encoder)[0] is not encoder:
+            self.projection = encoder.make_projection()  # type: ignore[operator]
+        elif any(parameter.requires_grad for parameter in encoder.parameters()):
+            layers = nn.Linear(encoder.features_dim, encoder.features_dim), nn.LayerNorm(encoder.features_dim)
+            self.projection = nn.Sequential(*layers).apply(orthogonal_init)
+
+    def forward(self, observations: Any) -> th.Tensor:
+        with th.no_grad():
+            trunk = parts(self.encoder)[0](observations)
+        return self.projection(trunk)
+
+
 class Actor(_CropsImages, SB3Actor):
     """
-    SB3's actor, which may read the critic's encoder detached.
+    SB3's actor, which also takes the trunk of the critic's encoder for observations.
 
-    :param share_features_extractor: Whether the features extractor is the critic's: then it gets no gradient from
-        here, and a projection (linear, layer norm) of the actor's own follows its trunk
     :param crop_size: Height and width in pixels that images are cropped to, None for no crop
     :param squash_log_std: None for SB3's clipping of the log standard deviation to [-20, 2]; bounds such as (-10, 2)
         for tanh squashing into them
@@ -101,7 +137,6 @@ class Actor(_CropsImages, SB3Actor):
     def __init__(
         self,
         *args: Any,
-        share_features_extractor: bool = False,
         crop_size: int | None = None,
         squash_log_std: tuple[float, float] | None = None,
         network: str = "mlp",
@@ -111,40 +146,26 @@ class Actor(_CropsImages, SB3Actor):
         self.network = network
         if network != "mlp":
             self.latent_pi = hidden_layers(network, self.features_dim, self.net_arch, self.activation_fn)
-        self.share_features_extractor = share_features_extractor
         self.crop_size = crop_size
         self.squash_log_std = squash_log_std
-        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
-        # An encoder that learns nothing, such as SB3's FlattenExtractor, is read as it is.
-        learns = any(parameter.requires_grad for parameter in self.features_extractor.parameters())
-        self.projection: nn.Module = nn.Identity()
-        if share_features_extractor and has_parts(self.features_extractor):
-            self.projection = self.features_extractor.make_projection()
-        elif share_features_extractor and learns:
-            layers = nn.Linear(self.features_dim, self.features_dim), nn.LayerNorm(self.features_dim)
-            self.projection = nn.Sequential(*layers).apply(orthogonal_init)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {
-            "share_features_extractor": self.share_features_extractor,
             "crop_size": self.crop_size,
             "squash_log_std": self.squash_log_std,
             "network": self.network,
         }
 
     def own_parameters(self) -> list[nn.Parameter]:
-        """The parameters that the actor loss trains: all but those of a shared encoder."""
-        shared = set(self.features_extractor.parameters()) if self.share_features_extractor else set()
-        return [parameter for parameter in self.parameters() if parameter not in shared]
+        """The parameters that the actor loss trains: all but those of the critic's encoder."""
+        extractor = self.features_extractor
+        critics = set(extractor.encoder.parameters()) if isinstance(extractor, DetachedEncoder) else set()
+        return [parameter for parameter in self.parameters() if parameter not in critics]
 
-    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+    def extract_features(self, obs: PyTorchObs | Trunk, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         if isinstance(obs, Trunk):
-            return self.projection(obs.values.detach())
-        if not self.share_features_extractor:
-            return super().extract_features(obs, features_extractor)
-        with th.no_grad():
-            trunk = read_trunk(features_extractor, self.preprocess(obs))
-        return self.projection(trunk)
+            return features_extractor.projection(obs.values.detach())  # type: ignore[operator]
+        return super().extract_features(obs, features_extractor)
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
         if self.squash_log_std is None or self.use_sde:
@@ -188,7 +209,7 @@ class Critic(_CropsImages, ContinuousCritic):
 
         :param obs: Observations (batch, ...)
         """
-        return Trunk(read_trunk(self.features_extractor, self.preprocess(obs)))
+        return Trunk(parts(self.features_extractor)[0](self.preprocess(obs)))
 
     def encode(self, obs: PyTorchObs | Trunk) -> th.Tensor:
         """
@@ -197,8 +218,8 @@ class Critic(_CropsImages, ContinuousCritic):
         :param obs: Observations (batch, ...), or their trunk
         :return: (batch, features_dim)
         """
-        values = obs.values if isinstance(obs, Trunk) else self.trunk(obs).values
-        return (self.features_extractor.project(values) if has_parts(self.features_extractor) else values).float()
+        trunk = obs if isinstance(obs, Trunk) else self.trunk(obs)
+        return parts(self.features_extractor)[1](trunk.values).float()
 
     def q_values(self, latent: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
@@ -234,10 +255,10 @@ class SACAuxPolicy(SACPolicy):
     :param features_extractor_kwargs: Its keyword arguments; of a network among them each encoder gets a copy
     :param share_features_extractor: True (default, CURL's pixel agent): the actor reads the critic's encoder
         detached, through a projection of its own. False: it has an encoder of its own, which the actor loss trains
-    :param augmentation: What ``augment`` does to images: ``random_crop``, ``random_shift``, ``none``, or ``auto``:
-        crop if all images are larger than ``crop_size``, shift if not
-    :param crop_size: Height and width in pixels of cropped images, None for 84 (paper, table 7). Where it is given,
-        images must not be smaller
+    :param augmentation: What training does to images: ``"random_shift"`` by up to 4 pixels (DrQ), ``"random_crop"`` to
+        ``crop_size`` with a centre crop elsewhere (CURL, paper), ``"none"``, or ``"auto"``: crop where ``crop_size`` is
+        given, else shift. Vectors are never augmented
+    :param crop_size: Height and width in pixels of cropped images, None for 84 (paper, table 7)
     :param squash_log_std: None (default, SB3): the log standard deviation is clipped to [-20, 2]. Bounds such as
         (-10, 2) (the public reference): tanh squashes it into them; gSDE ignores them
     :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases
@@ -284,8 +305,7 @@ class SACAuxPolicy(SACPolicy):
         # As SB3's NatureCNN: floats that are not scaled are mostly a mistake.
         is_image = is_image_space(observation_space, normalized_image=not normalize_images)
         assert is_image or not issubclass(encoder, PixelEncoder), (
-            f"{encoder.__name__} is for images, not for {observation_space}. Images that are floats already, such as "
-            "VecNormalize's, have to be channel first and need policy_kwargs=dict(normalize_images=False)"
+            f"{encoder.__name__} is for images, not for {observation_space}. {_image_advice(observation_space)}"
         )
         super().__init__(
             observation_space,
@@ -299,10 +319,9 @@ class SACAuxPolicy(SACPolicy):
         )
 
     def _build(self, lr_schedule: Schedule) -> None:
-        # SB3 shares the actor's encoder with the critic; here it is the critic's, and only a shared one comes first.
-        shared = self.make_features_extractor() if self.share_features_extractor else None
-        self.actor = self.make_actor(shared)
-        self.critic = self.make_critic(shared)
+        encoder = self.make_features_extractor() if self.share_features_extractor else None
+        self.actor = self.make_actor(None if encoder is None else DetachedEncoder(encoder))
+        self.critic = self.make_critic(encoder)
         if self.ortho_init:
             for network in (self.actor.latent_pi, self.actor.mu, self.actor.log_std, *self.critic.q_networks):
                 if isinstance(network, nn.Module):
@@ -344,7 +363,6 @@ class SACAuxPolicy(SACPolicy):
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         return Actor(
             **kwargs,
-            share_features_extractor=self.share_features_extractor,
             crop_size=self.crop_size if self.crops else None,
             squash_log_std=self.squash_log_std,
             network=self.network if isinstance(self.network, str) else self.network["pi"],

@@ -8,6 +8,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -18,9 +19,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
-from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
 
 from sb3_aarl import catalog
@@ -44,73 +45,76 @@ def _computes_bf16(device: th.device) -> bool:
     return device.type != "cpu" or th.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
 
 
+@dataclass(frozen=True)
+class AuxOptions:
+    """
+    How the auxiliary loss is trained: the keys of ``SACAux(aux_kwargs=...)``.
+
+    :param learning_rate: Of its optimizer, may be a schedule; None for SACAux's ``learning_rate``
+    :param batch_size: Windows for each update, None for SACAux's ``batch_size``
+    :param tau: Polyak coefficient of the momentum encoder (paper, table 7)
+    :param predictor_width: Hidden units of the predictor (paper, table 7), None for twice its input (the public reference)
+    :param joint: Whether one optimizer trains the encoder on the weighted sum of critic and auxiliary loss (equation 1).
+        By default the auxiliary loss has an optimizer of its own for encoder and predictor, as in CURL
+    :param coef: Weight lambda of the auxiliary loss in that sum; for ``joint`` alone, since an Adam of its own divides a
+        constant factor out again
+    """
+
+    learning_rate: float | Schedule | None = None
+    batch_size: int | None = None
+    tau: float = 0.05
+    predictor_width: int | None = 256
+    joint: bool = False
+    coef: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "predictor_width"):
+            if getattr(self, name) is not None and not getattr(self, name) >= 1:
+                raise ValueError(f"aux_kwargs: {name} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.tau <= 1:
+            raise ValueError(f"aux_kwargs: tau must be between 0 and 1, not {self.tau}")
+        if not 0 <= self.coef < float("inf"):
+            raise ValueError(f"aux_kwargs: coef must be a finite number of at least 0, not {self.coef}")
+        if self.coef != 1 and not self.joint:
+            raise ValueError("aux_kwargs: coef has no effect without joint=True")
+
+
 class SACAux(SAC):
     """
-    Soft Actor-Critic with an auxiliary loss on its encoder (AARL), around SB3's SAC.
+    Soft Actor-Critic whose encoder is also trained with an auxiliary loss (paper, section 3), around SB3's SAC.
 
     The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The encoder
-    of the target critic is the momentum encoder of the auxiliary loss. Arguments of SB3's SAC have its defaults, but for
-    ``ent_coef``: from the paper's 0.1 Cheetah-Run (action repeat 4) has 199 at 20,000 environment steps, from SAC's 1 it
-    has 34 (ten and two seeds), and both end level. On MuJoCo's tasks of Gymnasium SAC's is the safer one, with
-    ``learning_starts=5000``: see ``zoo_configs/sac_aux.yml``. Arguments of SACAux alone have the paper's (tables 7 and 8)
-    unless another source is named; all of the paper's values are in ``zoo_configs/``. From states encoder and loss are
-    those that learnt fastest (``results/README.md``), not the paper's.
+    of the target critic is the momentum encoder of the auxiliary loss. Arguments that are not here are SB3's.
 
     :param policy: ``"MlpPolicy"`` (``simba`` encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
-    :param learning_rate: Of actor and critic, may be a schedule
+    :param learning_rate: Of all optimizers that have none of their own, may be a schedule
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 0 freezes the whole target critic, as in SB3
     :param gamma: Discount factor
-    :param train_freq: As in SB3
-    :param gradient_steps: As in SB3; -1 for one per transition
-    :param action_noise: As in SB3
     :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
-    :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. One that is
-        detected and does not hold is given up, with a warning: whole observations are stored
+    :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. If one that
+        was detected does not hold, a warning is raised and whole observations are stored
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns
     :param ent_coef: As in SB3; ``"auto_0.1"`` (default, the paper) learns it from 0.1 on
     :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
-    :param target_entropy: As in SB3
-    :param use_sde: Whether to use gSDE, as in SB3
-    :param sde_sample_freq: As in SB3
-    :param use_sde_at_warmup: As in SB3
-    :param stats_window_size: As in SB3
-    :param tensorboard_log: As in SB3
-    :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``; where it names ``augmentation`` or ``crop_size``, they win
-    :param verbose: 0 no output, 1 info, 2 debug
-    :param seed: Seed of the pseudo random generators
-    :param device: Device of the networks
+    :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``
     :param aux_loss: An AuxLoss, its notation, a name of the catalogue, a YAML file such as a search's ``winner.yml``, or
         None for SAC with the same encoder (the paper's baseline). ``"auto"`` is AARL-Pixel if any observation is an image
-        and forward dynamics otherwise, and None where neither can be trained: the encoder has no parameters that learn, or
-        the replay buffer has no windows (HerReplayBuffer is refused unless it is None)
-    :param aux_coef: Weight lambda of the auxiliary loss (equation 1). It matters with ``joint_optimizer=True``; by
-        default the auxiliary loss has an Adam of its own, which divides a constant factor out again
-    :param aux_batch_size: Windows for each auxiliary update, None for ``batch_size``
-    :param encoder_tau: Polyak coefficient of the momentum encoder
-    :param encoder_learning_rate: Of the auxiliary loss's optimizer, may be a schedule; None for ``learning_rate``
-        (3e-3 for some pixel tasks). Without an auxiliary loss there is no such optimizer: the critic's trains the encoder
-    :param joint_optimizer: False (default, CURL and the reference): the auxiliary loss has an optimizer of its own for
-        encoder and predictor, beside the critic's, which trains the encoder too. True (equation 1): one optimizer trains
-        the encoder on the sum of both losses, at ``encoder_learning_rate``
-    :param predictor_width: Hidden units of the predictor (256), None for twice its input (the reference)
-    :param predictor_batch_norm: Whether the predictor has batch norm (the paper names none, the reference has it)
-    :param policy_delay: Gradient steps between updates of actor and entropy coefficient (2: CURL, the reference)
-    :param ent_coef_learning_rate: Of the entropy coefficient, may be a schedule; None for ``learning_rate`` (paper: 1e-4)
-    :param ent_coef_betas: Adam's betas for the entropy coefficient (SB3; paper: (0.5, 0.999))
-    :param augmentation: ``"random_crop"`` to ``crop_size`` in training with a centre crop elsewhere,
-        ``"random_shift"`` by up to 4 pixels, ``"none"``; ``"auto"`` crops if all images are larger than ``crop_size``
-        and shifts if not. Vectors are never augmented
-    :param crop_size: Height and width in pixels of cropped images, None for 84. Where it is given, images must not be smaller
+        and forward dynamics otherwise; where neither can be trained it is None, with a warning
+    :param aux_kwargs: How the loss is trained: ``learning_rate``, ``batch_size``, ``tau`` of the momentum encoder,
+        ``predictor_width``, ``joint`` and ``coef``, see ``AuxOptions``
+    :param policy_delay: Gradient steps between updates of actor and entropy coefficient (2: CURL, the public reference)
+    :param ent_coef_optimizer_kwargs: Arguments of the entropy coefficient's Adam, such as ``lr`` (else ``learning_rate``)
+        and ``betas``
     :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16; parameters, optimizers, Q
         targets, entropy, losses and predictions stay float32. A device without instructions for it (of x86 processors those
         without AVX-512) would be ten times slower: it computes in float32, and logs a warning
-    :param compile: Whether ``torch.compile`` compiles the losses, for a minute of the first gradient steps. It pays for wide
-        networks and long runs; without a C++ compiler logs a warning and goes on as it was
+    :param compile: Whether ``torch.compile`` compiles the losses in the first gradient steps, which takes a minute. It pays
+        for wide networks and long runs; without a C++ compiler logs a warning and nothing is compiled
     :raises ValueError: for arguments that do not fit, with the culprit's name
 
     Training stops with :class:`NonFiniteError` where something is NaN or infinite, and with
@@ -157,18 +161,9 @@ class SACAux(SAC):
         seed: int | None = None,
         device: th.device | str = "auto",
         aux_loss: AuxLoss | str | Path | Mapping[str, Any] | None = "auto",
-        aux_coef: float = 1.0,
-        aux_batch_size: int | None = None,
-        encoder_tau: float = 0.05,
-        encoder_learning_rate: float | Schedule | None = None,
-        joint_optimizer: bool = False,
-        predictor_width: int | None = 256,
-        predictor_batch_norm: bool = False,
+        aux_kwargs: dict[str, Any] | None = None,
         policy_delay: int = 2,
-        ent_coef_learning_rate: float | Schedule | None = None,
-        ent_coef_betas: tuple[float, float] = (0.9, 0.999),
-        augmentation: str = "auto",
-        crop_size: int | None = None,
+        ent_coef_optimizer_kwargs: dict[str, Any] | None = None,
         precision: str = "fp32",
         compile: bool = False,
         _init_setup_model: bool = True,
@@ -186,7 +181,7 @@ class SACAux(SAC):
             gradient_steps,
             action_noise,
             replay_buffer_class,
-            dict(replay_buffer_kwargs or {}),
+            replay_buffer_kwargs,
             optimize_memory_usage,
             n_steps,
             ent_coef,
@@ -197,25 +192,16 @@ class SACAux(SAC):
             use_sde_at_warmup,
             stats_window_size,
             tensorboard_log,
-            None if policy_kwargs is None else dict(policy_kwargs),
+            policy_kwargs,
             verbose,
             seed,
             device,
             _init_setup_model=False,
         )
         self.aux_loss = aux_loss
-        self.aux_coef = aux_coef
-        self.aux_batch_size = aux_batch_size
-        self.encoder_tau = encoder_tau
-        self.encoder_learning_rate = encoder_learning_rate
-        self.joint_optimizer = joint_optimizer
-        self.predictor_width = predictor_width
-        self.predictor_batch_norm = predictor_batch_norm
+        self.aux_kwargs = aux_kwargs
         self.policy_delay = policy_delay
-        self.ent_coef_learning_rate = ent_coef_learning_rate
-        self.ent_coef_betas = ent_coef_betas
-        self.augmentation = augmentation
-        self.crop_size = crop_size
+        self.ent_coef_optimizer_kwargs = ent_coef_optimizer_kwargs
         self.precision = precision
         self.compile = compile
 
@@ -225,6 +211,7 @@ class SACAux(SAC):
         self._q_value_check = QValueCheck()
         self._stored_timesteps = 0  # steps whose transitions are in the buffer
         self._frame_stack: int | dict[str, int] = 1  # as detected; saved, since load() may have no wrappers to look at
+        self._warned: set[str] = set()
 
         if _init_setup_model:
             self._setup_model()
@@ -233,34 +220,39 @@ class SACAux(SAC):
         # Not in the constructor: load() replaces attributes after it.
         if self.aux_loss is not None and self.aux_loss != "auto":
             self.aux_loss = catalog.resolve(self.aux_loss)
+        try:
+            self._aux = AuxOptions(**(self.aux_kwargs or {}))
+        except TypeError as error:
+            raise ValueError(f"aux_kwargs: {str(error).partition(' got ')[2]}") from None
         self._check_arguments()
         if self.replay_buffer_class is None:
             self.replay_buffer_class = WindowReplayBuffer
-        # load() compares policy_kwargs with those that were saved, and may change n_steps: they stay as the user gave them.
-        policy_kwargs, replay_buffer_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
-        self.policy_kwargs = {"augmentation": self.augmentation, "crop_size": self.crop_size, **policy_kwargs}
         with warnings.catch_warnings():
             if issubclass(self.replay_buffer_class, WindowReplayBuffer):
-                if self.env is not None:
-                    self._frame_stack = detect_frame_stack(self.env)
-                self.replay_buffer_kwargs = {"frame_stack": self._frame_stack, **replay_buffer_kwargs}
-                if self.n_steps > 1:  # SB3 expects that no buffer class but its own knows n-step returns
-                    warnings.filterwarnings("ignore", message="`n_steps=")
-                    self.replay_buffer_kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}
+                self._setup_replay_buffer(self.replay_buffer_class)
+                # SB3 expects that no buffer class but its own knows n-step returns.
+                warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
-        if isinstance(self.replay_buffer, WindowReplayBuffer):
-            self.replay_buffer.frame_stack_detected = "frame_stack" not in replay_buffer_kwargs
-        self.policy_kwargs, self.replay_buffer_kwargs = policy_kwargs, replay_buffer_kwargs
 
-        if self.ent_coef_optimizer is not None:
+        if self.ent_coef_optimizer is not None and self.ent_coef_optimizer_kwargs:
             assert self.log_ent_coef is not None
-            rate = self._schedule(self.ent_coef_learning_rate)(1)
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=rate, betas=self.ent_coef_betas)
+            kwargs = {"lr": self.lr_schedule(1), **self.ent_coef_optimizer_kwargs}
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], **kwargs)
         self._setup_aux_loss()
         if self.precision == "bf16" and not _computes_bf16(self.device):
             logger.warning("precision='bf16': this %s has no instructions for it, training in fp32", self.device.type.upper())
         if self.compile:
             self._compile_losses()
+
+    def _setup_replay_buffer(self, buffer_class: type[WindowReplayBuffer]) -> None:
+        if self.env is not None:
+            self._frame_stack = detect_frame_stack(self.env)
+        kwargs = {"frame_stack": self._frame_stack, **(self.replay_buffer_kwargs or {})}
+        if self.n_steps > 1:
+            kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}
+        space, actions, n_envs = self.observation_space, self.action_space, self.n_envs
+        self.replay_buffer = buffer_class(self.buffer_size, space, actions, device=self.device, n_envs=n_envs, **kwargs)
+        self.replay_buffer.frame_stack_detected = "frame_stack" not in (self.replay_buffer_kwargs or {})
 
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, SACAuxPolicy):
@@ -268,49 +260,48 @@ class SACAux(SAC):
                 "policy must be MlpPolicy, CnnPolicy, MultiInputPolicy or derived from sb3_aarl.policies.SACAuxPolicy, "
                 f"not {self.policy_class}: SB3's have no momentum encoder"
             )
-        counts = ("buffer_size", "batch_size", "policy_delay", "target_update_interval", "crop_size")
-        for name in (*counts, "aux_batch_size", "predictor_width"):
-            if getattr(self, name) is not None and not getattr(self, name) >= 1:
+        for name in ("buffer_size", "batch_size", "policy_delay", "target_update_interval"):
+            if not getattr(self, name) >= 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not 0 <= self.aux_coef < float("inf"):
-            raise ValueError(f"aux_coef must be a finite number of at least 0, not {self.aux_coef}")
-        for name in ("tau", "encoder_tau", "gamma"):
+        for name in ("tau", "gamma"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
         if self.precision not in ("fp32", "bf16"):
             raise ValueError(f"precision must be fp32 or bf16, not {self.precision!r}")
+        fixed = np.flatnonzero(self.action_space.low == self.action_space.high)  # type: ignore[attr-defined]
+        if len(fixed):
+            raise ValueError(f"action_space has low == high at index {fixed[0]}: remove what cannot be chosen from the action")
         buffer_class = self.replay_buffer_class or WindowReplayBuffer
-        if self.aux_loss is not None and issubclass(buffer_class, HerReplayBuffer):
-            raise ValueError("HerReplayBuffer has no windows, which an auxiliary loss needs: pass aux_loss=None")
         if isinstance(self.aux_loss, AuxLoss) and not issubclass(buffer_class, WindowReplayBuffer):
             raise ValueError(
-                f"{buffer_class.__name__} has no windows, which aux_loss={self.aux_loss} needs: WindowReplayBuffer has"
+                f"{buffer_class.__name__} has no windows, which aux_loss={self.aux_loss} needs: pass aux_loss=None, or a "
+                "buffer derived from WindowReplayBuffer"
             )
 
     def _setup_aux_loss(self) -> None:
         encoder = [parameter for parameter in self.critic.features_extractor.parameters() if parameter.requires_grad]
-        if self.aux_loss == "auto":
-            trainable = bool(encoder) and isinstance(self.replay_buffer, WindowReplayBuffer)
+        problem = None
+        if not encoder:
+            problem = f"{type(self.critic.features_extractor).__name__} has no parameters that the auxiliary loss could train"
+        elif not isinstance(self.replay_buffer, WindowReplayBuffer):
+            problem = f"{type(self.replay_buffer).__name__} has no windows"
+        if self.aux_loss == "auto" and problem:
+            logger.warning("aux_loss='auto': training without an auxiliary loss, since %s", problem)
+            self.aux_loss = None
+        elif self.aux_loss == "auto":
             name = "aarl-pixel" if self.policy.image_keys else "forward-dynamics"
-            self.aux_loss = catalog.load(name) if trainable else None
+            self.aux_loss = catalog.load(name)
             if self.verbose >= 1:
-                print(f"Auxiliary loss: {name if trainable else 'none'}")
+                print(f"Auxiliary loss: {name}")
         if self.aux_loss is None:
             return
         assert isinstance(self.aux_loss, AuxLoss)
-        if not encoder:
-            extractor = type(self.critic.features_extractor).__name__
-            raise ValueError(f"{extractor} has no parameters that the auxiliary loss could train: pass aux_loss=None")
-        self.aux_head = AuxHead(
-            self.aux_loss,
-            self.critic.features_extractor.features_dim,
-            get_action_dim(self.action_space),
-            self.predictor_width,
-            self.predictor_batch_norm,
-        ).to(self.device)
-        schedule = self._schedule(self.encoder_learning_rate)
-        self.aux_optimizer = self.policy.make_optimizer([*encoder, *self.aux_head.parameters()], schedule)
-        if self.joint_optimizer:
+        if problem:
+            raise ValueError(f"{problem}: pass aux_loss=None")
+        latent_dim, action_dim = self.critic.features_extractor.features_dim, get_action_dim(self.action_space)
+        self.aux_head = AuxHead(self.aux_loss, latent_dim, action_dim, self._aux.predictor_width).to(self.device)
+        self.aux_optimizer = self.policy.make_optimizer([*encoder, *self.aux_head.parameters()], self._aux_schedule)
+        if self._aux.joint:
             self.critic.optimizer = self.policy.make_optimizer(self.critic.q_parameters, self.lr_schedule)
 
     def _compile_losses(self) -> None:
@@ -325,16 +316,17 @@ class SACAux(SAC):
             # The random numbers are PyTorch's own.
             setattr(self, name, th.compile(getattr(self, name), options={"fallback_random": True}))
 
-    def _schedule(self, learning_rate: float | Schedule | None) -> Schedule:
-        return self.lr_schedule if learning_rate is None else FloatSchedule(learning_rate)
+    @property
+    def _aux_schedule(self) -> Schedule:
+        return self.lr_schedule if self._aux.learning_rate is None else FloatSchedule(self._aux.learning_rate)
 
     def _update_learning_rates(self) -> None:
-        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-        progress_remaining = self._current_progress_remaining
-        if self.ent_coef_optimizer is not None:
-            update_learning_rate(self.ent_coef_optimizer, self._schedule(self.ent_coef_learning_rate)(progress_remaining))
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None and "lr" not in (self.ent_coef_optimizer_kwargs or {}):
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
         if self.aux_optimizer is not None:
-            update_learning_rate(self.aux_optimizer, self._schedule(self.encoder_learning_rate)(progress_remaining))
+            update_learning_rate(self.aux_optimizer, self._aux_schedule(self._current_progress_remaining))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Batch norm and dropout of the networks that learn; the target critic stays in evaluation mode.
@@ -343,7 +335,7 @@ class SACAux(SAC):
         # Networks compute in bfloat16 if asked to; their outputs, and all that is computed from them, are float32.
         bf16 = self.precision == "bf16" and _computes_bf16(self.device)
         autocast = th.autocast(self.device.type, th.bfloat16, enabled=bf16)
-        with self._logged() as log:
+        with self._logged() as log, self._actor_checked():
             for _ in range(gradient_steps):
                 self._n_updates += 1
                 update_actor = self._n_updates % self.policy_delay == 0
@@ -358,8 +350,8 @@ class SACAux(SAC):
                 with autocast:
                     trunk = self.critic.trunk(batch.observations)
                     if update_actor:
-                        share = self.actor.share_features_extractor
-                        actions_pi, log_prob = self._act(trunk if share else batch.observations)
+                        detached = self.policy.share_features_extractor
+                        actions_pi, log_prob = self._act(trunk if detached else batch.observations)
 
                 # Entropy coefficient: before the critic as in SB3, and the whole step uses its value from before the update.
                 if self.ent_coef_optimizer is None:
@@ -381,13 +373,13 @@ class SACAux(SAC):
                     critic_loss = self._critic_loss(trunk, batch.actions, target_q)
                 log("critic_loss", critic_loss)
                 self.critic.optimizer.zero_grad()
-                if self.joint_optimizer:
+                if self._aux.joint:
                     self._backward_aux_loss(windows, autocast, log)
                 critic_loss.backward()  # with a joint optimizer it adds to the encoder's gradient
                 self.critic.optimizer.step()
-                if not self.joint_optimizer:
+                if not self._aux.joint:
                     self._backward_aux_loss(windows, autocast, log)
-                if self.aux_optimizer is not None and (self.joint_optimizer or windows is not None):
+                if self.aux_optimizer is not None and (self._aux.joint or windows is not None):
                     self.aux_optimizer.step()
 
                 # Actor: neither the encoder nor the critic gets a gradient from it.
@@ -443,21 +435,18 @@ class SACAux(SAC):
         """Transitions and windows of one gradient step, images augmented; no windows as long as no episode has one."""
         buffer, env, windows = self.replay_buffer, self._vec_normalize_env, None
         augment: Callable[[Any], Any] = self.policy.augment
-        assert buffer is not None
-        if isinstance(buffer, WindowReplayBuffer):  # less to copy: augment() finds nothing left to crop
-            buffer.crop_size = self.policy.crop_size if self.policy.crops else None
-        batch = buffer.sample(batch_size, env)
+        # Cropped while frames are gathered, which copies less: augment() finds nothing left to crop.
+        crop = {"crop_size": self.policy.crop_size} if self.policy.crops and isinstance(buffer, WindowReplayBuffer) else {}
+        batch = buffer.sample(batch_size, env, **crop)  # type: ignore[union-attr]
         batch = batch._replace(observations=augment(batch.observations), next_observations=augment(batch.next_observations))
         if self.aux_head is not None:
             assert isinstance(buffer, WindowReplayBuffer), "an auxiliary loss needs a WindowReplayBuffer"
             horizon, offsets = self.aux_head.loss.horizon, self.aux_head.offsets
             try:
-                windows = buffer.sample_windows(self.aux_batch_size or batch_size, horizon, env, offsets)
+                windows = buffer.sample_windows(self._aux.batch_size or batch_size, horizon, env, offsets, **crop)
                 windows = windows._replace(observations=augment(windows.observations))
             except NoWindowError:
                 self._n_aux_skipped += 1
-        if isinstance(buffer, WindowReplayBuffer):
-            buffer.crop_size = None  # a user's own sample() has whole images
         return batch, windows
 
     def _backward_aux_loss(
@@ -472,13 +461,13 @@ class SACAux(SAC):
         with autocast:
             aux_loss = self._aux_loss(windows)
         log("aux_loss", aux_loss)
-        (self.aux_coef * aux_loss).backward()
+        (self._aux.coef * aux_loss).backward()
 
     def _update_target(self) -> None:
         # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.
         if self.tau > 0:
             polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
-            polyak_update(self.critic.encoder_parameters, self.critic_target.encoder_parameters, self.encoder_tau)
+            polyak_update(self.critic.encoder_parameters, self.critic_target.encoder_parameters, self._aux.tau)
 
     @contextmanager
     def _logged(self) -> Iterator[Callable[[str, th.Tensor], None]]:
@@ -532,25 +521,38 @@ class SACAux(SAC):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
-        tb_log_name: str = "SAC",
+        tb_log_name: str = "SACAux",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfSACAux:
         if not reset_num_timesteps and self._stored_timesteps != self.num_timesteps:
             # A callback ended learn() before the last transition was stored: SB3 resets the environments.
             self._last_obs = None
+        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        if not self._n_updates and self.gradient_steps != 0:
+            self._warn_once("nothing was learnt: learning starts after %d agent steps", self.learning_starts)
+        elif self._n_updates and self._n_aux_skipped == self._n_updates:
+            self._warn_once("the auxiliary loss was never trained: no episode is as long as its horizon (%s)", self.aux_loss)
+        return self
+
+    def _warn_once(self, message: str, *args: Any) -> None:
+        if message not in self._warned:
+            logger.warning(message, *args)
+        self._warned.add(message)
+
+    def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
+        with self._actor_checked():
+            return super()._sample_action(*args, **kwargs)
+
+    @contextmanager
+    def _actor_checked(self) -> Iterator[None]:
+        """PyTorch's distributions refuse NaN before any loss is computed, and know neither the step nor the cause."""
         try:
-            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            yield
         except ValueError as error:
-            # PyTorch's distributions refuse NaN before any loss is computed, and know neither the step nor the cause.
             if "to satisfy the constraint" not in str(error):
                 raise
             raise NonFiniteError(f"an output of the actor is not finite at {self._describe(self._n_updates)}") from error
-        if not self._n_updates:
-            logger.warning("nothing was learnt: learning starts after %d agent steps", self.learning_starts)
-        elif self._n_aux_skipped == self._n_updates:
-            logger.warning("the auxiliary loss was never trained: no episode is as long as its horizon (%s)", self.aux_loss)
-        return self
 
     def training_state(self) -> dict[str, Any]:
         """
@@ -583,6 +585,38 @@ class SACAux(SAC):
         if self.aux_loss is not None and not isinstance(self.replay_buffer, WindowReplayBuffer):
             name, self.replay_buffer = type(self.replay_buffer).__name__, replay_buffer
             raise ValueError(f"{name} has no windows, which aux_loss={self.aux_loss} needs: only aux_loss=None can load it")
+
+    def set_parameters(
+        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        As in SB3. What belongs to an auxiliary loss that this model does not have is left out, with a warning; a loss that
+        the parameters know nothing of starts untrained, with a warning.
+        """
+        given: Any = load_path_or_dict
+        if not isinstance(given, dict):
+            given = load_from_zip_file(given, device=device, load_data=False)[1]
+        own, auxiliary = self.get_parameters(), {"aux_head", "aux_optimizer"}
+        surplus, missing = auxiliary & given.keys() - own.keys(), auxiliary & own.keys() - given.keys()
+        if surplus or (missing == auxiliary and exact_match):
+            text = "an auxiliary loss, which this model does not have" if surplus else "no auxiliary loss: it starts untrained"
+            logger.warning("the parameters are of a model with %s", text)
+            given = {name: value for name, value in given.items() if name not in surplus}
+            given |= {name: own[name] for name in missing}
+            key = "critic.optimizer"
+            if key in given and len(given[key]["param_groups"][0]["params"]) != len(own[key]["param_groups"][0]["params"]):
+                # With aux_kwargs=dict(joint=True) the auxiliary optimizer has the encoder's part of the state.
+                given[key] = own[key]
+        super().set_parameters(given, exact_match, device)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled losses compute with the networks of this model, not with those of a copy; nor can they be pickled.
+        return {name: value for name, value in vars(self).items() if name not in COMPILED}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self.compile:
+            self._compile_losses()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *COMPILED]

@@ -7,6 +7,7 @@ import re
 import types
 import warnings
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -777,13 +778,11 @@ def corner_of(crop: np.ndarray, image: np.ndarray) -> tuple[int, int]:
 def test_crops_are_parts_of_what_is_drawn_without(stack, n_steps, as_dict):
     buffer = image_buffer(stack, as_dict, n_steps=n_steps)
     corners = []
-    for draw in (buffer.sample, lambda n: buffer.sample_windows(n, 4, offsets=[4, 0, 2, 0])):
+    for draw in (buffer.sample, partial(buffer.sample_windows, horizon=4, offsets=[4, 0, 2, 0])):
         np.random.seed(3)
-        buffer.crop_size = None
         whole = draw(300)
         np.random.seed(3)
-        buffer.crop_size = CROP
-        cropped = draw(300)
+        cropped = draw(300, crop_size=CROP)
         for name in ("observations", "next_observations"):
             if not hasattr(whole, name):
                 continue
@@ -810,8 +809,7 @@ def test_normalized_images_are_not_cropped():
     space = spaces.Box(0, 255, (2, *SIZE), np.float32)
     normalize = VecNormalize(DummyVecEnv([lambda: Shown(space)]))
     buffer = image_buffer(1)
-    buffer.crop_size = CROP
-    assert buffer.sample(5, env=normalize).observations.shape == (5, 2, *SIZE)
+    assert buffer.sample(5, env=normalize, crop_size=CROP).observations.shape == (5, 2, *SIZE)
 
 
 # --- In SACAux --------------------------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ class Walk(gym.Env):
 
 def make_model(env: Any, **kwargs: Any) -> SACAux:
     policy_kwargs = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8}}
-    arguments = {"buffer_size": 200, "learning_starts": 5, "batch_size": 8, "predictor_width": 8, "seed": 0, "device": "cpu"}
+    arguments = {"buffer_size": 200, "learning_starts": 5, "batch_size": 8, "seed": 0, "device": "cpu"}
     return SACAux("MlpPolicy", env, aux_loss="forward-dynamics", policy_kwargs=policy_kwargs, **{**arguments, **kwargs})
 
 

@@ -141,4 +141,4 @@ def test_pages_build_without_warnings(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "html" / "api" / "sac_aux.html").read_text(encoding="utf-8")
-    assert "encoder_tau" in page and "Polyak coefficient of the momentum encoder" in page
+    assert "aux_kwargs" in page and "Polyak coefficient of the momentum encoder" in page

@@ -210,7 +210,7 @@ def test_running_statistics_are_shared_saved_and_not_learnt_from_predictions(tmp
     )
 
     def statistics(some: SACAux) -> list[th.Tensor]:
-        encoders = some.critic.features_extractor, some.critic_target.features_extractor, some.actor.features_extractor
+        encoders = some.critic.features_extractor, some.critic_target.features_extractor
         found = [[buffer.clone() for buffer in encoder.buffers()] for encoder in encoders]
         assert all(th.equal(one, other) for others in found[1:] for one, other in zip(found[0], others, strict=True))
         return found[0]

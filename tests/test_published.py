@@ -42,7 +42,7 @@ def make_model(observation: str, env: gym.Env, loss: object) -> SACAux:
         batch_size=8,
         policy_delay=1,
         target_update_interval=1,
-        predictor_width=16,
+        aux_kwargs={"predictor_width": 16},
         aux_loss=loss,
         policy_kwargs={
             "net_arch": [16],

@@ -36,7 +36,13 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "normalize": ("InvertedPendulum-v5", {"normalize": True, "n_steps": 3}),
     "two": (
         "dm_control/reacher-easy-v0",
-        {"env_kwargs": {"action_repeat": 20}, "n_envs": 2, "train_freq": 3, "gradient_steps": -1, "joint_optimizer": True},
+        {
+            "env_kwargs": {"action_repeat": 20},
+            "n_envs": 2,
+            "train_freq": 3,
+            "gradient_steps": -1,
+            "aux_kwargs": {"joint": True},
+        },
     ),
     # The second checkpoint lies between random actions.
     "noise": ("Pendulum-v1", {"use_sde": True, "sde_sample_freq": 4, "n_envs": 2, "normalize": {}, "learning_starts": 70}),

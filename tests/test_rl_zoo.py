@@ -47,9 +47,9 @@ def test_trains_with_the_hyperparameters_of_the_file(trained: Path) -> None:
     assert (model.batch_size, model.buffer_size, model.learning_starts, model.seed) == (8, 500, 260, 3)
     # Table 8.
     assert model.lr_schedule(1) == 2e-4  # Cheetah-Run's own
-    assert (model.tau, model.encoder_tau, model.gamma, model.target_update_interval) == (0.01, 0.05, 0.99, 2)
-    assert (model.ent_coef, model.ent_coef_learning_rate, list(model.ent_coef_betas)) == ("auto_0.1", 1e-4, [0.5, 0.999])
-    assert model.aux_loss == catalog.load("aarl-state") and model.predictor_width == 256
+    assert (model.tau, model.aux_kwargs["tau"], model.gamma, model.target_update_interval) == (0.01, 0.05, 0.99, 2)
+    assert (model.ent_coef, model.ent_coef_optimizer_kwargs) == ("auto_0.1", {"lr": 1e-4, "betas": [0.5, 0.999]})
+    assert model.aux_loss == catalog.load("aarl-state") and model.aux_kwargs["predictor_width"] == 256
     assert model.policy_kwargs["net_arch"] == [1024, 1024]
     assert type(model.critic.features_extractor) is DenseMLP and model.critic.features_extractor.features_dim == 40
     # The action repeat of 4 in training and evaluation.

@@ -330,7 +330,7 @@ def test_tensorboard_has_every_evaluation_of_a_short_run(tmp_path: Path) -> None
 
 
 def test_learning_rates_that_fall(tmp_path: Path) -> None:
-    rates = {"learning_rate": "lin_1e-2", "encoder_learning_rate": "lin_2e-3", "ent_coef_learning_rate": "lin_4e-4"}
+    rates = {"learning_rate": "lin_1e-2", "aux_kwargs": {"learning_rate": "lin_2e-3"}}
     prepare_run(tmp_path, make_run(hyperparameters=DENSE | rates, keep_model=True))
     train(tmp_path)
     model = SACAux.load(tmp_path / "model.zip")

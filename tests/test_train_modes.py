@@ -80,8 +80,7 @@ def test_bfloat16_is_what_networks_compute_in_and_nothing_else(kind: str) -> Non
 def test_bfloat16_computes_almost_the_same_gradients(kind: str) -> None:
     gradients = []
     for precision in ("fp32", "bf16"):
-        rates: dict[str, float] = {"learning_rate": 0.0, "encoder_learning_rate": 0.0, "ent_coef_learning_rate": 0.0}
-        model = filled_model(kind, precision=precision, policy_delay=1, **rates)
+        model = filled_model(kind, precision=precision, policy_delay=1, learning_rate=0.0, aux_kwargs={"learning_rate": 0.0})
         model.train(1, batch_size=128)
         trained = {
             "encoder": model.critic.features_extractor.parameters(),

@@ -54,8 +54,7 @@ VARIANTS = [*STATE_VARIANTS, *PIXEL_VARIANTS]
 COMMON: dict[str, Any] = {
     "buffer_size": 100_000,
     "learning_starts": 1000,
-    "ent_coef_betas": (0.5, 0.999),
-    "ent_coef_learning_rate": 1e-4,
+    "ent_coef_optimizer_kwargs": {"lr": 1e-4, "betas": [0.5, 0.999]},
     "tau": 0.01,
     "target_update_interval": 2,
     "gamma": 0.99,
@@ -68,7 +67,7 @@ PUBLIC_START = {"ortho_init": True, "squash_log_std": [-10, 2]}
 
 
 SB3_SAC = {"aux_loss": None, "ent_coef": "auto", "policy_delay": 1, "policy_kwargs": {"features_extractor_class": "identity"}}
-MUJOCO = {"learning_starts": 5000, "ent_coef": "auto", "ent_coef_learning_rate": 6e-4}
+MUJOCO = {"learning_starts": 5000, "ent_coef": "auto", "ent_coef_optimizer_kwargs": {"lr": 6e-4}}
 
 
 def action_repeat(task: str) -> int:
@@ -77,10 +76,9 @@ def action_repeat(task: str) -> int:
 
 
 def with_loss(aux_loss: str | None, auxiliary: dict[str, Any]) -> dict[str, Any]:
-    """The loss, and the keys that only runs with a loss have."""
-    if aux_loss == "auto":
-        return auxiliary
-    return {"aux_loss": aux_loss} if aux_loss is None else {"aux_loss": aux_loss, **auxiliary}
+    """The loss, and what only runs with a loss have in aux_kwargs."""
+    loss = {} if aux_loss == "auto" else {"aux_loss": aux_loss}
+    return {**loss, "aux_kwargs": {"tau": 0.05, **({} if aux_loss is None else auxiliary)}}
 
 
 def table_8(variant: str, task: str) -> dict[str, Any]:
@@ -89,13 +87,12 @@ def table_8(variant: str, task: str) -> dict[str, Any]:
     kwargs = {"features_extractor_kwargs": {"features_dim": 40, "n_layers": n_layers, "width": 40}}  # width: not in the paper
     return {
         **COMMON,
-        **with_loss(aux_loss, {"predictor_width": 256}),
+        **({"aux_loss": None} if encoder == "identity" else with_loss(aux_loss, {"predictor_width": 256})),
         "policy": "MlpPolicy",
         "n_timesteps": (1_000_000 if task in DIFFICULT else 100_000) // repeat,
         "env_kwargs": {"action_repeat": repeat},
         "learning_rate": 2e-4 if task == "cheetah-run" else 1e-3,
         "batch_size": 512,
-        **({} if encoder == "identity" else {"encoder_tau": 0.05}),
         "policy_kwargs": {**ADAM, "features_extractor_class": encoder, **(PUBLIC_START if encoder == "identity" else kwargs)},
     }
 
@@ -104,22 +101,21 @@ def table_7(variant: str, task: str) -> dict[str, Any]:
     aux_loss, crop, column = PIXEL_VARIANTS[variant]
     repeat = action_repeat(task)
     final = {
-        "encoder_learning_rate": 3e-3 if task in ("cheetah-run", "finger-spin", "walker-walk") else 1e-3,
-        "aux_batch_size": {"walker-walk": 128, "cheetah-run": 256, "finger-spin": 256}.get(task, 512),
+        "learning_rate": 3e-3 if task in ("cheetah-run", "finger-spin", "walker-walk") else 1e-3,
+        "batch_size": {"walker-walk": 128, "cheetah-run": 256, "finger-spin": 256}.get(task, 512),
     }
-    auxiliary = final if column else {"encoder_learning_rate": 1e-3, "aux_batch_size": 128}
+    auxiliary = final if column else {"learning_rate": 1e-3, "batch_size": 128}
     return {
         **COMMON,
         **with_loss(aux_loss, {"predictor_width": 256, **auxiliary}),
         "policy": "CnnPolicy",
         "n_timesteps": 500_000 // repeat,
         "env_kwargs": {"pixels": True, "image_size": 100 if crop else 84, "frame_stack": 3, "action_repeat": repeat},
-        **({"augmentation": "random_crop", "crop_size": 84} if crop else {"augmentation": "none"}),
         "learning_rate": 2e-4 if column and task == "cheetah-run" else 1e-3,
         "batch_size": 512 if column else 128,
-        "encoder_tau": 0.05,
         "policy_kwargs": {
             **ADAM,
+            **({"augmentation": "random_crop", "crop_size": 84} if crop else {"augmentation": "none"}),
             "features_extractor_class": "pixel",
             "features_extractor_kwargs": {"features_dim": 50, "n_layers": 4, "n_filters": 32},
         },
@@ -192,7 +188,9 @@ def shared_env(env_id: str, env_kwargs: tuple[tuple[str, Any], ...]) -> gym.Env:
 def test_builds_and_trains(variant: str, task: str) -> None:
     values = load_hyperparameters(ZOO / "paper" / f"{variant}.yml", f"dm_control/{task}-v0")
     env = shared_env(f"dm_control/{task}-v0", tuple(values.pop("env_kwargs").items()))
-    small = {"buffer_size": 30, **({"aux_batch_size": 4} if "aux_batch_size" in values else {})}
+    small = {"buffer_size": 30}
+    if "batch_size" in values.get("aux_kwargs", {}):
+        values["aux_kwargs"]["batch_size"] = 4
     values["policy_kwargs"]["net_arch"] = [8]
     del values["n_timesteps"]
     model = SACAux(values.pop("policy"), env, **{**values, **small}, seed=0, device="cpu")

@@ -10,7 +10,7 @@ HYPERPARAMETERS: dict[str, Any] = {
     "policy": "MlpPolicy",
     "learning_starts": 40,
     "batch_size": 8,
-    "predictor_width": 8,
+    "aux_kwargs": {"predictor_width": 8},
     "policy_kwargs": {"net_arch": [8], "features_extractor_class": "mlp", "features_extractor_kwargs": {"features_dim": 4}},
 }
 YAML = yaml.safe_dump({"default": HYPERPARAMETERS})
@@ -19,7 +19,7 @@ DENSE: dict[str, Any] = {
     "buffer_size": 1000,
     "learning_starts": 20,
     "batch_size": 16,
-    "predictor_width": 8,
+    "aux_kwargs": {"predictor_width": 8},
     "policy_kwargs": {
         "net_arch": [8],
         "features_extractor_class": "dense_mlp",
