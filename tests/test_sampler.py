@@ -21,8 +21,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_aarl.search.evolution import mutations
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.evolution.space import PRIORS, loss_of, loss_to_params, params_to_loss, random_loss, suggest_aux_loss
-from sb3_aarl.search.evolution.surrogate import features
-from sklearn.linear_model import BayesianRidge
+from sb3_aarl.search.evolution.surrogate import TokenModel
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
@@ -147,14 +146,11 @@ def offspring(
 
 
 def choice(rng: np.random.Generator, known: Any, losses: list[AuxLoss], max_horizon: int, sign: float) -> int:
-    """The offspring that one posterior draw of scikit-learn's model of all rows rates highest."""
+    """The offspring that one draw from the posterior after all generations rates highest."""
     rows = [loss for generation in known for loss, _, _ in generation]
-    scores = sign * np.array([score(loss) for loss in rows])
-    centred = features(rows, max_horizon) - features(rows, max_horizon).mean(axis=0)
-    model = BayesianRidge().fit(centred, (scores - scores.mean()) / scores.std())
-    precision = model.alpha_ * centred.T @ centred + model.lambda_ * np.eye(centred.shape[1])
-    weights = model.coef_ + np.linalg.inv(np.linalg.cholesky(precision)).T @ rng.standard_normal(centred.shape[1])
-    return int(np.argmax(features(losses, max_horizon) @ weights))
+    model = TokenModel(max_horizon)
+    model.add(rows, [sign * score(loss) for loss in rows])
+    return int(np.argmax(model.draw(losses, rng, own=False)))
 
 
 @pytest.mark.parametrize("screening", [1, 4])

@@ -15,7 +15,7 @@ from optuna.trial import create_trial
 from sb3_aarl.search.evolution.racing import standings
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import distributions, loss_of, loss_to_params, random_loss
-from sb3_aarl.search.evolution.surrogate import features
+from sb3_aarl.search.evolution.surrogate import TokenModel
 from sb3_aarl.search.execution.driver import SearchProgress
 from sb3_aarl.search.execution.matrix import Cell, run_matrix, scores
 from sb3_aarl.search.results.report import stored_baselines
@@ -25,7 +25,6 @@ from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make
 from sb3_aarl.search.studies.status import matrix_status
 from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError
-from sklearn.linear_model import BayesianRidge
 from tiny import SEARCH, write_search
 
 from sb3_aarl import AuxLoss, catalog
@@ -273,8 +272,9 @@ def test_finalists_that_the_surrogate_rates_highest() -> None:
     study = optuna.create_study(direction="maximize")
     for loss, score in zip(losses, scores, strict=True):
         study.add_trial(create_trial(params=loss_to_params(loss), distributions=distributions(loss.horizon, 3), value=score))
-    rows = features(losses, 3)
-    ratings = BayesianRidge().fit(rows, scores).predict(rows)
+    model = TokenModel(3)
+    model.add(losses, scores)
+    ratings = model.posterior(losses)[0]
     by_score = np.argsort(scores)[::-1]
     others = sorted(by_score[4:], key=lambda index: -ratings[index])
     assert cross_validation.top_losses(study, 4, 3) == [losses[i] for i in (*by_score[:4], *others[:3])]

@@ -3,10 +3,10 @@
 import contextlib
 import logging
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from sb3_aarl.search.evolution import mutations, space
@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 # Draws for one slot before a duplicate is accepted: only very small spaces run out of new losses.
 MAX_DRAWS = 300
 
+ParentSelection = Literal["best", "posterior"]
 IsKnown = Callable[[AuxLoss], bool]  # whether the search has a canonical form already
 
 
@@ -41,6 +42,8 @@ class Settings:
     screening: int = 1
     n_generations: int | None = None
     initial: Sequence[AuxLoss] = ()
+    parent_selection: ParentSelection = "best"
+    again: float = 0.0
 
     def __post_init__(self) -> None:
         self.operators = None if self.operators is None else tuple(self.operators)
@@ -50,7 +53,9 @@ class Settings:
         self._check_arguments(shares)
         # Operations of all slots. Random ones come first in later generations: they need no parents.
         self._first = ["given"] * len(self.initial) + ["random"] * self.n_random + ["prior"] * self.n_prior
-        self._later = [name for name, count in _apportion(shares, self.population_size).items() for _ in range(count)]
+        n_again = round(self.again * self.population_size)
+        counts = {**_apportion(shares, self.population_size - n_again), "again": n_again}
+        self._later = [name for name, count in counts.items() for _ in range(count)]
 
     def _check_arguments(self, shares: dict[str, float]) -> None:
         positive = {name: getattr(self, name) for name in ("population_size", "max_horizon", "screening", "n_generations")}
@@ -58,13 +63,18 @@ class Settings:
         for name, number in positive.items():
             if number is not None and number < 1:
                 raise ValueError(f"{name} must be at least 1, not {number}")
-        for name, number in {**shares, "n_random": self.n_random, "n_prior": self.n_prior, "seed": self.seed}.items():
+        others = {"n_random": self.n_random, "n_prior": self.n_prior, "seed": self.seed, "again": self.again}
+        for name, number in {**shares, **others}.items():
             if number is not None and not number >= 0:
                 raise ValueError(f"{name} must not be negative, not {number}")
         if abs(sum(shares.values()) - 1) > 1e-9:
             raise ValueError(f"the shares {', '.join(shares)} must sum to 1, not {sum(shares.values())}")
         if not 0 < self.parents <= 1:
             raise ValueError(f"parents must be a share in (0, 1], not {self.parents}")
+        if self.again > 1:
+            raise ValueError(f"again must be a share in [0, 1], not {self.again}")
+        if self.parent_selection not in get_args(ParentSelection):
+            raise ValueError(f"parent_selection must be best or posterior, not {self.parent_selection!r}")
         space.check_operators(self.operators)
         for loss in self.initial:
             space.loss_to_params(loss, self.operators)
@@ -77,11 +87,12 @@ class Settings:
 
 
 class Candidate(NamedTuple):
-    """A loss for one slot, how it was made, and the numbers of the trials that it stems from."""
+    """A loss for one slot, how it was made, the numbers of the trials that it stems from, and which seed it trains."""
 
     loss: AuxLoss
     operation: str
     parents: tuple[int, ...] = ()
+    seed_index: int = 0
 
 
 class Result(NamedTuple):
@@ -107,6 +118,8 @@ class Candidates:
         self.generation = 1  # the first one that is not over
         self.parents: list[Result] = []
         self.model = TokenModel(settings.max_horizon)
+        self.known: dict[AuxLoss, Result] = {}  # the first scored trial of each canonical form
+        self.repeats: Counter[AuxLoss] = Counter()
         self.plan: dict[tuple[int, int], Candidate] = {}
         self.to_plan = deque(self._round())
         # Canonical forms in the order in which they came, and how many there were at the end of each round.
@@ -140,10 +153,17 @@ class Candidates:
         for result in results:
             self.seen.setdefault(result.loss.canonical(), len(self.seen))
         scored = [result for result in results if not math.isnan(result.score)]
-        if self.settings.screening > 1:
-            self.model.add([result.loss for result in scored], [result.score for result in scored])
-        n_parents = max(1, round(self.settings.parents * len(results)))
-        self.parents = sorted(scored, key=lambda result: -result.score)[:n_parents] or list(results)
+        for result in scored:
+            self.known.setdefault(result.loss.canonical(), result)
+        settings, ratings, of_whom = self.settings, [result.score for result in scored], scored
+        if settings.screening > 1 or settings.again or settings.parent_selection == "posterior":
+            self.model.add([result.loss for result in scored], ratings)
+        if settings.parent_selection == "posterior" and self.known:
+            of_whom = list(self.known.values())
+            ratings = list(self.model.posterior([result.loss for result in of_whom])[0])
+        n_parents = max(1, round(settings.parents * len(results)))
+        order = sorted(range(len(of_whom)), key=lambda index: -ratings[index])
+        self.parents = [of_whom[index] for index in order[:n_parents]] or list(results)
         self.generation += 1
         self.to_plan.extend(self._round())
 
@@ -159,6 +179,8 @@ class Candidates:
     def _plan_next(self) -> None:
         slot = self.to_plan[0]
         self.plan[slot] = self._draw(*slot, 0, self.seen.__contains__)
+        if self.plan[slot].operation == "again":
+            self.repeats[self.plan[slot].loss.canonical()] += 1
         self.seen.setdefault(self.plan[slot].loss.canonical(), len(self.seen))
         self.to_plan.popleft()
         if not self.to_plan:
@@ -170,12 +192,26 @@ class Candidates:
         operation = operations[slot % len(operations)]
         if operation == "given" and slot < len(operations) and attempt == 0:
             return Candidate(self.settings.initial[slot], operation)
+        if operation == "again":
+            if slot < len(operations) and attempt == 0 and self.known:
+                return self._again(rng)
+            operation = "replacement"
         # What replaces a failed random loss must not depend on whether the model knows another generation by then.
         is_early = attempt > 0 and operation == "random"
-        if self.settings.screening == 1 or not self.model.losses or is_early:
+        if self.settings.screening == 1 or not self.known or is_early:
             return self._draw_new(rng, operation, slot, is_known)
-        offspring = [self._draw_new(rng, operation, slot, is_known) for _ in range(self.settings.screening)]
-        return offspring[self.model.best([candidate.loss for candidate in offspring], self.model.draw(rng))]
+        offspring: list[Candidate] = []
+        for _ in range(self.settings.screening):
+            offspring.append(self._draw_new(rng, operation, slot, is_known))
+            operation = offspring[-1].operation  # that of a crossover that is not possible is another one
+        ratings = self.model.draw([candidate.loss for candidate in offspring], rng, own=False)
+        return offspring[int(np.argmax(ratings))]
+
+    def _again(self, rng: np.random.Generator) -> Candidate:
+        """Thompson sampling: the loss that one draw from the posterior of all losses rates highest, with its next seed."""
+        results = list(self.known.values())
+        best = results[int(np.argmax(self.model.draw([result.loss for result in results], rng)))]
+        return Candidate(best.loss, "again", (best.number,), 1 + self.repeats[best.loss.canonical()])
 
     def _draw_new(self, rng: np.random.Generator, operation: str, slot: int, is_known: IsKnown) -> Candidate:
         """One offspring, redrawn while it is invalid or known."""

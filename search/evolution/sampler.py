@@ -14,10 +14,10 @@ import numpy as np
 from optuna.distributions import BaseDistribution
 from optuna.samplers import BaseSampler, RandomSampler
 from optuna.study import Study, StudyDirection
-from optuna.trial import FrozenTrial, TrialState
-from sb3_aarl.search.evolution import space
+from optuna.trial import FrozenTrial, Trial, TrialState
+from sb3_aarl.search.evolution import mutations, space
 from sb3_aarl.search.evolution.candidates import Candidates, Result, Settings
-from sb3_aarl.search.evolution.space import SLOT_KEY
+from sb3_aarl.search.evolution.space import SEED_INDEX_KEY, SLOT_KEY
 
 from sb3_aarl.aux_loss import AuxLoss
 
@@ -57,8 +57,9 @@ class AuxLossSampler(Settings, BaseSampler):
     slot if there is one, and the others of its parameters are drawn at random.
 
     Trials that are pruned, have no finite score or violate a constraint (``trial.set_constraint``) are parents only if there
-    are no others in their generation. Other samplers may hold this one (``PartialFixedSampler``, ``independent_sampler``): the
-    loss of a trial is the one that its parameters name.
+    are no others in their generation. What is searched beside the loss is inherited from a parent and, every other time,
+    changed. Other samplers may hold this one (``PartialFixedSampler``, ``independent_sampler``): the loss of a trial is the
+    one that its parameters name.
 
     Two processes that share a study draw for one slot if they ask at the same moment. They train one loss, and the trial that
     finishes first counts.
@@ -80,12 +81,19 @@ class AuxLossSampler(Settings, BaseSampler):
     :param allow_duplicates: Whether a loss may be trained again, as in the paper; else a candidate whose canonical form is
         already there is redrawn
     :param seed: Seed of the evolution, not negative; None for a random one. A study keeps its first seed
-    :param screening: Offspring that are drawn for each slot, of which the one is kept that a Bayesian linear model of the
-        tokens, fitted to the generations before, rates highest under one posterior draw; 1 for the paper's evolution
+    :param screening: Offspring that are drawn for each slot, of which the one is kept that the Gaussian process, fitted to the
+        generations before, rates highest under one posterior draw; 1 for the paper's evolution
     :param n_generations: Number of generations, for ``free_slots`` and ``stop_when_complete``; None for no end
     :param initial: Losses for the first slots of the first generation
+    :param parent_selection: ``best`` takes the best scores of the last generation, as the paper does; ``posterior`` the losses
+        of all generations whose posterior mean, which a Gaussian process of the tokens has of them, is highest
+    :param again: Share of the slots of later generations, 0 for the paper's evolution, that train a known loss with another
+        seed (:meth:`seed_index`): by Thompson sampling, one that could be the best. The other shares divide the rest
+    :param independent_sampler: For parameters beside those of the loss, instead of inheritance
     :raises ValueError: naming the argument that does not fit
     """
+
+    independent_sampler: BaseSampler | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,6 +126,14 @@ class AuxLossSampler(Settings, BaseSampler):
             return [slots.progress(number) for number in range(1, 1 + (self.n_generations or slots.last_started))]
 
     @staticmethod
+    def seed_index(trial: Trial | FrozenTrial) -> int:
+        """
+        Which seed a trial trains: 0, or k if it repeats a loss for the k-th time. Train other seeds for each; it is the user
+        attribute ``seed_index``.
+        """
+        return trial.user_attrs.get(SEED_INDEX_KEY, 0)
+
+    @staticmethod
     def stored_settings(study: Study) -> dict[str, Any]:
         """The arguments of the sampler that a study was started with, as plain values; none if it had another sampler."""
         return study._storage.get_study_system_attrs(study._study_id).get(SETTINGS_KEY, {})
@@ -136,7 +152,7 @@ class AuxLossSampler(Settings, BaseSampler):
                 for key, value in assigned.items():
                     study._storage.set_trial_system_attr(trial._trial_id, key, value)
             trial.system_attrs.update(assigned)
-            for key in ("generation", "slot", "attempt", "operation", "parents"):
+            for key in ("generation", "slot", "attempt", "operation", "parents", SEED_INDEX_KEY):
                 study._storage.set_trial_user_attr(trial._trial_id, key, assigned[SLOT_KEY][key])
                 trial.user_attrs[key] = assigned[SLOT_KEY][key]
         return trial.system_attrs[SLOT_KEY]
@@ -152,17 +168,25 @@ class AuxLossSampler(Settings, BaseSampler):
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
         """
-        What the user searches beside the loss is drawn at random, as a function of the slot like the loss itself. Parameters
-        of the loss come here where another sampler holds this one as its ``independent_sampler``.
+        A parameter that is searched beside the loss. Those of the loss come here where another sampler holds this one as its
+        ``independent_sampler``.
         """
         assigned = self._assign(study, trial)
         planned = self._planned(assigned)
         if param_name in planned and planned[param_name] in space.values(param_distribution):
             return planned[param_name]
         key = [assigned.get(name, 0) for name in ("seed", "generation", "slot", "attempt", "enqueued")]
-        key.append(zlib.crc32(param_name.encode()))
-        sampler = RandomSampler(int(np.random.SeedSequence(key).generate_state(1)[0]))
-        return sampler.sample_independent(study, trial, param_name, param_distribution)
+        rng = np.random.default_rng([*key, zlib.crc32(param_name.encode())])
+        trials = study._storage.get_all_trials(study._study_id, deepcopy=False)
+        parents = [trials[number] for number in assigned["parents"]]
+        inherited = [p.params[param_name] for p in parents if p.distributions.get(param_name) == param_distribution]
+        if inherited and assigned["operation"] == "again":
+            return inherited[0]
+        if self.independent_sampler is not None:
+            return self.independent_sampler.sample_independent(study, trial, param_name, param_distribution)
+        if inherited:
+            return mutations.other_parameter(inherited[rng.integers(len(inherited))], param_distribution, rng)
+        return RandomSampler(int(rng.integers(2**32))).sample_independent(study, trial, param_name, param_distribution)
 
     def _planned(self, assigned: dict[str, Any]) -> dict[str, Any]:
         """The parameters of the loss that is planned for a slot; none where a user enqueued some of them."""
@@ -182,16 +206,17 @@ class AuxLossSampler(Settings, BaseSampler):
     def _study_seed(self, study: Study) -> int:
         """The seed of a study. One that was started with other settings is refused: its slots mean something else."""
         # Without n_generations: a search may be continued.
-        names = [field.name for field in fields(self) if field.name not in ("seed", "n_generations")]
-        settings = json.loads(json.dumps({name: getattr(self, name) for name in names}, default=str))
+        free = ("seed", "n_generations", "independent_sampler")
+        of_fields = {field.name: field for field in fields(self) if field.name not in free}
+        settings = json.loads(json.dumps({name: getattr(self, name) for name in of_fields}, default=str))
         stored = self.stored_settings(study)
         if not stored:
             seed = int(np.random.SeedSequence().generate_state(1)[0]) if self.seed is None else self.seed
             stored = {**settings, "seed": seed}
             study._storage.set_study_system_attr(study._study_id, SETTINGS_KEY, stored)
         for name, value in settings.items():
-            if stored.get(name) != value:
-                raise ValueError(f"this study was started with {name}={stored.get(name)!r}, not {value!r}: use another study")
+            if (old := stored.get(name, of_fields[name].default)) != value:  # an older version has fewer settings
+                raise ValueError(f"this study was started with {name}={old!r}, not {value!r}: use another study")
         if self.seed not in (None, stored["seed"]):
             logger.warning("The study keeps its own seed %d, not %d", stored["seed"], self.seed)
         return stored["seed"]
@@ -285,8 +310,10 @@ class _Slots:
         key: dict[str, Any] = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
         key |= {"max_horizon": self.sampler.max_horizon, "operators": self.sampler.operators}
         if is_enqueued:  # an invalid one costs no attempt: the next one in the slot is drawn by its own number
-            return {SLOT_KEY: {**key, "enqueued": number + 1, "operation": "enqueued", "parents": [], "loss": None}}
+            key |= {"enqueued": number + 1, "operation": "enqueued", "parents": [], "loss": None, SEED_INDEX_KEY: 0}
+            return {SLOT_KEY: key}
         if again := self.interrupted.get(free[0]):
             return {name: value for name, value in again.system_attrs.items() if name in (SLOT_KEY, FIXED_KEY)}
-        loss, operation, parents = self.candidates.of_slot(generation, slot, attempt)
-        return {SLOT_KEY: {**key, "operation": operation, "parents": list(parents), "loss": str(loss)}}
+        loss, operation, parents, seed_index = self.candidates.of_slot(generation, slot, attempt)
+        key |= {"operation": operation, "parents": list(parents), "loss": str(loss), SEED_INDEX_KEY: seed_index}
+        return {SLOT_KEY: key}

@@ -13,6 +13,7 @@ from optuna.trial import BaseTrial, FixedTrial, FrozenTrial
 from sb3_aarl.aux_loss import LONGEST_HORIZON, OPERATORS, AuxLoss, Token
 
 MAX_HORIZON = 10  # paper, section 2.1
+SEED_INDEX_KEY = "seed_index"  # user attribute of a trial: 0, or k where it repeats a loss for the k-th time
 SLOT_KEY = "AuxLossSampler:slot"  # system attribute of a trial: its slot, its planned loss and the space, in one piece
 
 

@@ -1,69 +1,107 @@
-"""A Bayesian linear model of what each token of a loss is worth, for screening offspring before they are trained."""
+"""A Gaussian process over losses: what is known of a loss from its own runs, and from those of losses with similar tokens."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from sklearn.linear_model import BayesianRidge
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
 from threadpoolctl import ThreadpoolController
 
 from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
 # Of a score: such as -sys.float_info.max, which stands for a failure.
 LARGEST = 1e100
+# Losses that the model is fitted to, the last ones: its cost grows with their number to the third power.
+MOST_LOSSES = 1000
+# What is fitted is one of these: the distance over which losses are alike, and the parts of the variance of scores that come
+# from tokens, from a loss alone, and from one run.
+LENGTHS = (4.0, 8.0, 16.0)
+SHARES = tuple((i / 8, j / 8, 1 - (i + j) / 8) for i in range(1, 7) for j in range(1, 8 - i))
 # The matrices are too small for threads: where runs have the cores, a fit with several takes a second, with one 16 ms.
 BLAS = ThreadpoolController()
 
 
 def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
     """
-    The bits of both masks of the canonical forms, the number of states, actions and rewards of each mask (so that tokens of
-    one kind share what they have in common), horizon, operator and negatives: (n_losses, n_features) floats.
+    Points whose squared distance is the number of tokens in which the canonical forms of two losses differ, where each step
+    into the future counts 0.8 times the one before, plus 1 for other operators, and 1 for negatives: (n_losses, n_features).
     """
     losses = [loss.canonical() for loss in losses]
     masks = np.zeros((len(losses), 2, 3 * max_horizon + 1))
     for mask, loss in zip(masks, losses, strict=True):
         mask[:, : 3 * loss.horizon + 1] = loss.source, loss.target
-    counts = [masks[:, :, kind::3].sum(axis=2) for kind in range(3)]
-    others = [[loss.horizon, *(loss.operator == name for name in OPERATORS), loss.negatives] for loss in losses]
-    return np.hstack([masks.reshape(len(losses), -1), *counts, np.array(others, dtype=float)])
+    masks *= 0.8 ** (np.arange(3 * max_horizon + 1) // 3 / 2)
+    operators = [[*(np.sqrt(0.5) * (loss.operator == name) for name in OPERATORS), loss.negatives] for loss in losses]
+    return np.hstack([masks.reshape(len(losses), -1), np.array(operators, dtype=float)])
 
 
 class TokenModel:
-    """scikit-learn's BayesianRidge on all finished trials. Scores are standardised, so that their unit does not matter."""
+    """
+    The true value of a loss, its mean score over all seeds, is a sum: a part that losses with similar tokens share, and one of
+    its own. A score is the true value and the noise of one run.
+    """
 
     def __init__(self, max_horizon: int):
         self.max_horizon = max_horizon
-        self.losses: list[AuxLoss] = []
-        self.values: list[float] = []
-        n_features = 6 * max_horizon + 2 + 6 + 1 + len(OPERATORS) + 1
-        # The posterior of the weights: its mean, and a square root of its covariance. Before there are data, nothing.
-        self.mean = np.zeros(n_features)
-        self.root = np.eye(n_features)
+        self.scores: dict[AuxLoss, list[float]] = {}  # of each canonical form
 
-    def add(self, losses: Sequence[AuxLoss], values: Sequence[float]) -> None:
-        """Add finished trials and fit again; values (higher is better) that are not finite, or too large, are skipped."""
-        finite = [(loss, value) for loss, value in zip(losses, values, strict=True) if abs(value) < LARGEST]
-        self.losses += [loss for loss, _ in finite]
-        self.values += [value for _, value in finite]
-        scores = np.array(self.values)
-        if not finite or scores.std() <= 1e-12 * abs(scores.mean()):
-            return  # no scores, or all alike: nothing to learn
+    def add(self, losses: Sequence[AuxLoss], scores: Sequence[float]) -> None:
+        """Add runs and fit again; scores (higher is better) that are not finite, or too large, are skipped."""
+        for loss, score in zip(losses, scores, strict=True):
+            if abs(score) < LARGEST:
+                self.scores.setdefault(loss.canonical(), []).append(score)
+        for form in list(self.scores)[:-MOST_LOSSES]:
+            del self.scores[form]
+        if self.scores:
+            with BLAS.limit(limits=1, user_api="blas"):
+                self._fit()
+
+    def _fit(self) -> None:
+        """Choose the most probable variances; all of SHARES count alike but those near 0, of which there are many."""
+        runs = list(self.scores.values())
+        self._centre, scale = np.mean(np.concatenate(runs)), np.std(np.concatenate(runs)) or 1.0
+        counts = np.array([len(scores) for scores in runs])
+        means = (np.array([np.mean(scores) for scores in runs]) - self._centre) / scale
+        within = sum(np.var(scores) * len(scores) for scores in runs) / scale**2
+        n_runs, n_repeats = counts.sum(), (counts - 1).sum()
+        self._points = features(list(self.scores), self.max_horizon)
+        distances = cdist(self._points, self._points, "sqeuclidean")
+        best = -np.inf
+        for length in LENGTHS:
+            alike = np.exp(-distances / length)
+            for shares in SHARES:
+                of_tokens, own, noise = shares
+                factor = cho_factor(of_tokens * alike + np.diag(own + noise / counts), lower=True)
+                weights = cho_solve(factor, means)
+                squares = means @ weights + within / noise + 1e-12
+                log_p = -np.log(np.diag(factor[0])).sum() - 0.5 * (n_runs * np.log(squares) + n_repeats * np.log(noise))
+                if (log_p := log_p + np.log(shares).sum()) > best:
+                    best, self.length, self.shares, self._factor = log_p, length, shares, factor
+                    self._weights, self.variance = scale * weights, scale**2 * squares / n_runs
+
+    def posterior(self, losses: Sequence[AuxLoss], own: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Mean and covariance of the true values of losses; with ``own=False`` without what is not known of the part of each loss
+        alone, which says nothing about which one to try.
+        """
         with BLAS.limit(limits=1, user_api="blas"):
-            rows = features(self.losses, self.max_horizon)
-            ridge = BayesianRidge().fit(rows, (scores - scores.mean()) / scores.std())
-            deviations = rows - rows.mean(axis=0)
-            precision = ridge.alpha_ * deviations.T @ deviations + ridge.lambda_ * np.eye(rows.shape[1])
-            self.mean = ridge.coef_
-            self.root = np.linalg.inv(np.linalg.cholesky(precision)).T
+            points = features(losses, self.max_horizon)
+            to_known = self._kernel(cdist(points, self._points, "sqeuclidean"))
+            mean = self._centre + to_known @ self._weights
+            prior = self._kernel(cdist(points, points, "sqeuclidean"), own)
+            return mean, self.variance * (prior - to_known @ cho_solve(self._factor, to_known.T))
 
-    def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """One draw of the weights from the posterior."""
-        return self.mean + self.root @ rng.standard_normal(len(self.mean))
+    def _kernel(self, distances: np.ndarray, own: bool = True) -> np.ndarray:
+        of_tokens, alone, _ = self.shares
+        return of_tokens * np.exp(-distances / self.length) + own * alone * (distances == 0)
+
+    def draw(self, losses: Sequence[AuxLoss], rng: np.random.Generator, own: bool = True) -> np.ndarray:
+        """One draw of the true values of losses from the posterior."""
+        mean, covariance = self.posterior(losses, own)
+        covariance += 1e-6 * self.variance * np.eye(len(mean))  # losses may be almost alike
+        with BLAS.limit(limits=1, user_api="blas"):
+            return mean + np.linalg.cholesky(covariance) @ rng.standard_normal(len(mean))
 
     def rating(self, loss: AuxLoss) -> float:
-        """What a loss is worth by the mean of the posterior, in deviations of the scores, but for a constant."""
-        return float((features([loss], self.max_horizon) @ self.mean)[0])
-
-    def best(self, losses: Sequence[AuxLoss], weights: np.ndarray) -> int:
-        """Index of the loss that the weights of :meth:`draw` rate highest."""
-        return int(np.argmax(features(losses, self.max_horizon) @ weights))
+        """The mean of the posterior of a loss."""
+        return float(self.posterior([loss])[0][0])
