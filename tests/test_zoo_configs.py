@@ -5,6 +5,7 @@ import functools
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,12 @@ import gymnasium as gym
 import pytest
 import torch as th
 import yaml
+from sb3_aarl.search.studies.benchmark import read_variants
 from sb3_aarl.search.training.config import load_hyperparameters
 from stable_baselines3.common.logger import Logger
 
-from sb3_aarl import SACAux, catalog, encoders
+from sb3_aarl import AuxLoss, SACAux, catalog, encoders
+from sb3_aarl.aux_loss import OPERATORS
 from sb3_aarl.envs import env_ids, make_dmc_env
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
@@ -147,6 +150,17 @@ def test_tables_7_and_8(variant: str) -> None:
     # The last one is in no table: "Others" there.
     for env_id, task in {**ids, "dm_control/swimmer-swimmer6-v0": "swimmer-swimmer6"}.items():
         assert load_hyperparameters(path, env_id) == expected(variant, task), task
+
+
+def test_ten_operators_on_forward_dynamics() -> None:
+    variants = read_variants(ZOO / "paper" / "operators.yml")
+    losses = {name: AuxLoss.parse(changes["aux_loss"]) for name, _, _, changes in variants}
+    forward = catalog.load("forward-dynamics")
+    assert losses == {
+        f"forward_{operator}{'_negatives' * negatives}": replace(forward, operator=operator, negatives=negatives)
+        for operator in OPERATORS
+        for negatives in (True, False)
+    }
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
