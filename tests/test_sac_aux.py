@@ -8,6 +8,7 @@ import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -505,8 +506,11 @@ def test_a_horizon_longer_than_any_episode_is_skipped_and_counted(joint: bool, c
     assert not th.equal(model.aux_head.state_dict()["predictor.0.weight"], before["predictor.0.weight"])
 
 
-def test_a_run_that_learns_nothing_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    make_model(learning_starts=50).learn(50)
+def test_a_run_that_learns_nothing_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
+    model = make_model(learning_starts=50)
+    for _ in range(3):
+        model.learn(1, reset_num_timesteps=False)
+    make_model(gradient_steps=0).learn(50)  # asked for
     assert [record.getMessage() for record in caplog.records] == ["nothing was learnt: learning starts after 50 agent steps"]
 
 
@@ -603,6 +607,38 @@ def test_parameters_include_the_auxiliary_ones(joint: bool) -> None:
     del parameters["aux_head"]
     with pytest.raises(ValueError, match="aux_head"):
         fresh.set_parameters(parameters)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_loading_without_the_loss_or_with_one(joint: bool, tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Back to plain SAC after pre-training, and the other way round: all but the auxiliary loss is loaded, with a warning."""
+    for before, after, text in ((LOSS, None, "which this model does not have"), (None, LOSS, "it starts untrained")):
+        trained = make_model(aux_loss=before, aux_kwargs={"joint": joint}).learn(40)
+        trained.save(tmp_path / "model")
+        loaded = SACAux.load(tmp_path / "model", make_env("state"), aux_loss=after)
+        given = make_model(aux_loss=after, aux_kwargs={"joint": joint}, seed=9)
+        given.set_parameters(trained.get_parameters(), exact_match=before is None)
+        for model in (loaded, given):
+            assert_same(dict(model.policy.state_dict()), dict(trained.policy.state_dict()))
+            model.learn(30)
+        messages = [record.getMessage() for record in caplog.records]
+        assert len(messages) == 2 and all(text in message for message in messages)
+        caplog.clear()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda model: cloudpickle.loads(cloudpickle.dumps(model))])
+def test_a_copy_of_a_compiled_model_trains_its_own_networks(copied: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler = th.compile
+    monkeypatch.setattr(th, "compile", lambda function, **kwargs: compiler(function, backend="eager"))
+    model = make_model(compile=True).learn(30)
+    before = everything(model)
+    twin = copied(model)
+    assert_same(everything(twin), before)
+    twin.train(2, batch_size=16)
+    assert_same(everything(model), before)
+    changed = everything(twin)
+    for part in ("policy", "aux_head"):
+        assert any(not th.equal(value, changed[name]) for name, value in before.items() if name.startswith(part))
 
 
 def test_loading_with_other_n_step_returns(tmp_path: pathlib.Path) -> None:
@@ -744,6 +780,35 @@ def test_the_frame_stack_is_detected(tmp_path: pathlib.Path) -> None:
         make_model("pixels", replay_buffer_kwargs={"frame_stack": 3}).learn(20)
 
 
+@pytest.mark.parametrize(
+    ("shape", "advice"),
+    [((84, 84), "add a channel"), ((4, 40, 40, 3), "SB3's VecFrameStack"), ((4, 40, 40, 1), "without a channel")],
+    ids=str,
+)
+def test_images_of_a_wrong_layout(shape: tuple[int, ...], advice: str) -> None:
+    env = Point("pixels")
+    env.observation_space = spaces.Box(0, 255, shape, np.uint8)
+    with pytest.raises(AssertionError, match=f"An image has three dimensions: .*{advice}"):
+        SACAux("CnnPolicy", env)
+
+
+def test_an_action_that_cannot_be_chosen() -> None:
+    env = Point()
+    env.action_space = spaces.Box(np.array([-1, 0.5], np.float32), np.array([1, 0.5], np.float32))
+    with pytest.raises(ValueError, match="action_space has low == high at index 1"):
+        SACAux("MlpPolicy", env)
+
+
+def test_an_error_of_the_environments_own_is_raised_as_it_is() -> None:
+    class Broken(Point):
+        def step(self, action: np.ndarray) -> Any:
+            th.distributions.Normal(th.tensor(math.nan), 1.0, validate_args=True)
+
+    with pytest.raises(ValueError, match="to satisfy the constraint") as error:
+        make_model(env=DummyVecEnv([Broken])).learn(5)
+    assert not isinstance(error.value, NonFiniteError)
+
+
 class NaNAt(gym.Wrapper):
     """Returns NaN at one step."""
 
@@ -841,9 +906,10 @@ def test_q_values_that_explode() -> None:
 
 
 @pytest.mark.parametrize(("kind", "name"), [("state", "forward-dynamics"), ("pixels", "aarl-pixel"), ("dict", "aarl-pixel")])
-def test_auto_loss(kind: str, name: str, capsys: pytest.CaptureFixture) -> None:
+def test_auto_loss(kind: str, name: str, capsys: pytest.CaptureFixture, caplog: pytest.LogCaptureFixture) -> None:
     model = make_model(kind, aux_loss="auto", verbose=1)
     assert model.aux_loss == catalog.load(name)
     assert f"Auxiliary loss: {name}\n" in capsys.readouterr().out
     identity = {"features_extractor_class": "identity", "features_extractor_kwargs": {}}
     assert make_model("state", aux_loss="auto", policy_kwargs=identity).aux_loss is None
+    assert "training without an auxiliary loss, since FlattenExtractor has no parameters" in caplog.text
