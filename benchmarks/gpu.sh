@@ -24,10 +24,13 @@ cd "$(dirname "$0")/.."
 out=$(mkdir -p "$1" && cd "$1" && pwd)
 python=${PYTHON:-python3}
 device=cuda limit=530 slower=1 settings="small state pixels pixels-512" compiled="small state pixels" rounds=5 seconds=0.2
-processes="1 4 16" at_once=4 batch= runs=build/gpu_runs checkpoints=100k every=5k episodes=3
+processes="1 4 16" at_once=4 batch= seeds=0,1 runs=build/gpu_runs variants=results/pixels/cheetah_run/variants.yml
+checkpoints=100k every=5k episodes=3
 if [ "${REHEARSAL:-}" ]; then
     device=cpu limit=1800 slower=5 settings="small state pixels" compiled=small rounds=2 seconds=0
-    processes="1 2" at_once=1 batch="--batch-size 16" runs=$(mktemp -d) checkpoints=800 every=400 episodes=1
+    processes="1 2" at_once=1 batch="--batch-size 16" seeds=0 runs=$(mktemp -d) small=$(mktemp --suffix .yml)
+    sed 's/n_timesteps:/batch_size: 4\n    aux_kwargs: {batch_size: 4}\n    &/' $variants > "$small"
+    variants=$small checkpoints=800 every=400 episodes=1
     export OMP_NUM_THREADS=1
 fi
 export MUJOCO_GL=${MUJOCO_GL:-egl} PYTHONUNBUFFERED=1 PYTHONSAFEPATH=1
@@ -59,8 +62,8 @@ if [ "${2:-}" = --curves ]; then
         echo run,environment_steps,mean,std,episodes,seconds
         find "$runs" -name curve.csv | sort | while read -r file; do sed "1d;s|^|${file#"$runs"/},|" "$file"; done
     }
-    part pixels 500 "$python" -m sb3_aarl.search.cli.main benchmark results/pixels/cheetah_run/variants.yml \
-        --envs cheetah-run --seeds 0,1 --checkpoints $checkpoints --every $every --episodes $episodes \
+    part pixels 500 "$python" -m sb3_aarl.search.cli.main benchmark $variants \
+        --envs cheetah-run --seeds $seeds --checkpoints $checkpoints --every $every --episodes $episodes \
         --workers 6 --folder "$runs" &
     while sleep 5 && kill -0 $! 2> /dev/null; do curves > "$out/pixels.csv"; done
     curves > "$out/pixels.csv"
