@@ -177,11 +177,20 @@ class SimbaEncoder(Encoder):
     :param features_dim: Width of the latent state and of all blocks; 128 learnt slower on Cheetah-Run (results/body)
     :param n_blocks: Number of residual blocks
     :param normalize: Whether observations are normalised; VecNormalize would do the same before
+    :param observation: Whether the (normalised) observation stands beside the latent state, as a part of it
     """
 
-    def __init__(self, observation_space: spaces.Space, features_dim: int = 64, n_blocks: int = 1, normalize: bool = True):
-        super().__init__(observation_space, features_dim, trunk_dim=features_dim)
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        features_dim: int = 64,
+        n_blocks: int = 1,
+        normalize: bool = True,
+        observation: bool = False,
+    ):
         inputs = get_flattened_obs_dim(observation_space)
+        super().__init__(observation_space, features_dim + inputs * observation, trunk_dim=features_dim + inputs * observation)
+        self.observation = observation
         self.normalization: nn.Module = RunningNorm(inputs) if normalize else nn.Identity()
         blocks = [SimbaBlock(features_dim) for _ in range(n_blocks)]
         self.layers = nn.Sequential(nn.Linear(inputs, features_dim), *blocks, nn.LayerNorm(features_dim))
@@ -189,7 +198,8 @@ class SimbaEncoder(Encoder):
         self.projection = nn.Sequential()
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        return self.layers(self.normalization(observations.reshape(observations.shape[0], -1)))
+        x = self.normalization(observations.reshape(observations.shape[0], -1))
+        return th.cat([self.layers(x), x], dim=1) if self.observation else self.layers(x)
 
 
 VECTOR_ENCODERS: Mapping[str, type[DenseMLP] | type[SimbaEncoder]] = {

@@ -4,7 +4,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-HEADS = ("mlp", "layer_norm", "simba")
+CRITIC_NORMS = (None, "layer", "batch")
 
 
 def orthogonal_init(module: nn.Module) -> None:
@@ -41,26 +41,23 @@ class SimbaBlock(nn.Module):
         return x + self.layers(x)
 
 
-def hidden_layers(network: str, inputs: int, net_arch: list[int], activation_fn: type[nn.Module]) -> nn.Sequential:
+def q_network(norm: str | None, inputs: int, net_arch: list[int], activation_fn: type[nn.Module]) -> nn.Sequential:
     """
-    The hidden layers of an actor or critic.
+    A Q network.
 
-    :param network: ``"mlp"`` as in SB3, ``"layer_norm"`` with layer norm before each activation, or ``"simba"``: a linear
-        layer, a residual block (with ReLU) for each width of ``net_arch``, and layer norm
-    :param inputs: Width of the input
+    :param norm: None as in SB3; ``"layer"``: layer norm before each activation; ``"batch"``: batch norm before each linear
+        layer, the last one too (CrossQ, Bhatt et al., 2024)
+    :param inputs: Width of latent state and action together
     :param net_arch: Widths of the hidden layers
     :param activation_fn: Class of the activations
-    :raises ValueError: for an unknown network
     """
-    if network not in HEADS:
-        raise ValueError(f"unknown network {network!r}, expected one of {', '.join(HEADS)}")
-    if network != "simba":
-        norms: list[type[nn.Module]] = [nn.LayerNorm] if network == "layer_norm" else []
-        return nn.Sequential(*create_mlp(inputs, -1, net_arch, activation_fn, post_linear_modules=norms))
-    layers: list[nn.Module] = []
-    for width in net_arch:
-        if not layers or width != inputs:
-            layers.append(nn.Linear(inputs, width))
-        layers.append(SimbaBlock(width))
-        inputs = width
-    return nn.Sequential(*layers, nn.LayerNorm(inputs))
+    if norm not in CRITIC_NORMS:
+        raise ValueError(f"unknown critic_norm {norm!r}, expected one of {', '.join(map(str, CRITIC_NORMS))}")
+    layers = create_mlp(inputs, 1, net_arch, activation_fn, post_linear_modules=[nn.LayerNorm] if norm == "layer" else [])
+    if norm == "batch":
+        layers = [
+            part
+            for layer in layers
+            for part in ([nn.BatchNorm1d(layer.in_features, 1e-3, 0.01)] if isinstance(layer, nn.Linear) else []) + [layer]
+        ]
+    return nn.Sequential(*layers)

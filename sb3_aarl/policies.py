@@ -1,7 +1,8 @@
 """Policies of SACAux: actor, critic and momentum target around one encoder, which belongs to the critic."""
 
 import copy
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ from sb3_aarl.augmentation import (
     resolve_augmentation,
 )
 from sb3_aarl.encoders import Encoder, MultiInputEncoder, PixelEncoder, SimbaEncoder, encoder_class
-from sb3_aarl.networks import hidden_layers, orthogonal_init
+from sb3_aarl.networks import orthogonal_init, q_network
 
 
 class _CropsImages:
@@ -130,7 +131,6 @@ class Actor(_CropsImages, SB3Actor):
     :param crop_size: Height and width in pixels that images are cropped to, None for no crop
     :param squash_log_std: None for SB3's clipping of the log standard deviation to [-20, 2]; bounds such as (-10, 2)
         for tanh squashing into them
-    :param network: Kind of its hidden layers, see ``networks.hidden_layers``
     :param kwargs: Those of SB3's actor
     """
 
@@ -139,13 +139,9 @@ class Actor(_CropsImages, SB3Actor):
         *args: Any,
         crop_size: int | None = None,
         squash_log_std: tuple[float, float] | None = None,
-        network: str = "mlp",
         **kwargs: Any,
     ):
         super().__init__(*args, **kwargs)
-        self.network = network
-        if network != "mlp":
-            self.latent_pi = hidden_layers(network, self.features_dim, self.net_arch, self.activation_fn)
         self.crop_size = crop_size
         self.squash_log_std = squash_log_std
 
@@ -153,7 +149,6 @@ class Actor(_CropsImages, SB3Actor):
         return super()._get_constructor_parameters() | {
             "crop_size": self.crop_size,
             "squash_log_std": self.squash_log_std,
-            "network": self.network,
         }
 
     def own_parameters(self) -> list[nn.Parameter]:
@@ -188,19 +183,18 @@ class Critic(_CropsImages, ContinuousCritic):
     SB3's critic around the encoder that the critic loss and the auxiliary loss train.
 
     :param crop_size: Height and width in pixels that images are cropped to, None for no crop
-    :param network: Kind of its hidden layers, see ``networks.hidden_layers``
+    :param norm: None, ``"layer"`` or ``"batch"``, see ``networks.q_network``
     :param kwargs: Those of SB3's critic
     """
 
-    def __init__(self, *args: Any, crop_size: int | None = None, network: str = "mlp", **kwargs: Any):
+    def __init__(self, *args: Any, crop_size: int | None = None, norm: str | None = None, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.crop_size = crop_size
-        if network != "mlp":
-            for i, q_network in enumerate(self.q_networks):
-                assert isinstance(q_network, nn.Sequential)
-                inputs = kwargs["features_dim"] + get_action_dim(self.action_space)
-                hidden = hidden_layers(network, inputs, kwargs["net_arch"], kwargs["activation_fn"])
-                self.q_networks[i] = nn.Sequential(*hidden, q_network[-1])
+        self.norm = norm
+        if norm is not None:
+            inputs = kwargs["features_dim"] + get_action_dim(self.action_space)
+            for i in range(len(self.q_networks)):
+                self.q_networks[i] = q_network(norm, inputs, kwargs["net_arch"], kwargs["activation_fn"])
                 setattr(self, f"qf{i}", self.q_networks[i])
 
     def trunk(self, obs: PyTorchObs) -> Trunk:
@@ -231,6 +225,15 @@ class Critic(_CropsImages, ContinuousCritic):
         """
         inputs = th.cat([latent, actions], dim=1)
         return tuple(q_network(inputs).float() for q_network in self.q_networks)
+
+    @contextmanager
+    def batch_statistics(self) -> Iterator[None]:
+        """Batch norms of the Q networks use the statistics of the batch, and learn from them; elsewhere the running ones."""
+        for network in self.q_networks:
+            network.train()
+        yield
+        for network in self.q_networks:
+            network.eval()
 
     @cached_property
     def q_parameters(self) -> list[nn.Parameter]:
@@ -263,9 +266,8 @@ class SACAuxPolicy(SACPolicy):
         (-10, 2) (the public reference): tanh squashes it into them; gSDE ignores them
     :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases
         (CURL, the reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
-    :param network: Kind of the hidden layers of actor and critic: ``"mlp"`` (default, SB3), ``"layer_norm"`` (before each
-        activation) or ``"simba"`` (a residual block for each width of ``net_arch``); as with ``net_arch``, a dict such as
-        ``dict(pi="mlp", qf="layer_norm")`` where they differ
+    :param critic_norm: None (SB3), ``"layer"``: layer norm in the Q networks, or ``"batch"``: batch norm there, one pass of
+        both states and no target Q networks (CrossQ, Bhatt et al., 2024)
     :param kwargs: activation_fn, use_sde, log_std_init, use_expln, clip_mean, normalize_images, optimizer_class,
         optimizer_kwargs and n_critics of SB3's SACPolicy
     """
@@ -289,7 +291,7 @@ class SACAuxPolicy(SACPolicy):
         crop_size: int | None = None,
         squash_log_std: tuple[float, float] | None = None,
         ortho_init: bool = False,
-        network: str | dict[str, str] = "mlp",
+        critic_norm: str | None = None,
         **kwargs: Any,
     ):
         normalize_images = kwargs.get("normalize_images", True)
@@ -298,7 +300,7 @@ class SACAuxPolicy(SACPolicy):
         self.crop_size = CROP_SIZE if crop_size is None else crop_size
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
-        self.network = network
+        self.critic_norm = critic_norm
         encoder = encoder_class(features_extractor_class or self.default_encoder)
         if issubclass(encoder, MultiInputEncoder) and not normalize_images:
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
@@ -365,7 +367,6 @@ class SACAuxPolicy(SACPolicy):
             **kwargs,
             crop_size=self.crop_size if self.crops else None,
             squash_log_std=self.squash_log_std,
-            network=self.network if isinstance(self.network, str) else self.network["pi"],
         ).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
@@ -375,7 +376,7 @@ class SACAuxPolicy(SACPolicy):
         return Critic(
             **kwargs,
             crop_size=self.crop_size if self.crops else None,
-            network=self.network if isinstance(self.network, str) else self.network["qf"],
+            norm=self.critic_norm,
         ).to(self.device)
 
     def augment(self, obs: PyTorchObs) -> PyTorchObs:
@@ -401,7 +402,7 @@ class SACAuxPolicy(SACPolicy):
             "crop_size": self.crop_size,
             "squash_log_std": self.squash_log_std,
             "ortho_init": self.ortho_init,
-            "network": self.network,
+            "critic_norm": self.critic_norm,
         }
 
 

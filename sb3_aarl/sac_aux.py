@@ -100,6 +100,7 @@ class SACAux(SAC):
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns
     :param ent_coef: As in SB3; ``"auto_0.1"`` (default, the paper) learns it from 0.1 on
+    :param target_entropy: As in SB3; ``"auto_0.5"`` is half of what ``"auto"`` is
     :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
     :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``
     :param aux_loss: An AuxLoss, its notation, a name of the catalogue, a YAML file such as a search's ``winner.yml``, or
@@ -225,6 +226,9 @@ class SACAux(SAC):
         except TypeError as error:
             raise ValueError(f"aux_kwargs: {str(error).partition(' got ')[2]}") from None
         self._check_arguments()
+        if isinstance(self.target_entropy, str) and self.target_entropy.startswith("auto_"):
+            share = float(self.target_entropy.removeprefix("auto_"))
+            self.target_entropy = -share * get_action_dim(self.action_space)
         if self.replay_buffer_class is None:
             self.replay_buffer_class = WindowReplayBuffer
         with warnings.catch_warnings():
@@ -369,8 +373,11 @@ class SACAux(SAC):
 
                 # Critic and, through it, the encoder.
                 with autocast:
-                    target_q = self._target_q(batch.next_observations, batch.rewards, batch.dones, discounts, ent_coef)
-                    critic_loss = self._critic_loss(trunk, batch.actions, target_q)
+                    if self.critic.norm == "batch":
+                        critic_loss = self._joint_critic_loss(trunk, batch, discounts, ent_coef)
+                    else:
+                        target_q = self._target_q(batch.next_observations, batch.rewards, batch.dones, discounts, ent_coef)
+                        critic_loss = self._critic_loss(trunk, batch.actions, target_q)
                 log("critic_loss", critic_loss)
                 self.critic.optimizer.zero_grad()
                 if self._aux.joint:
@@ -419,6 +426,21 @@ class SACAux(SAC):
 
     def _critic_loss(self, trunk: Trunk, actions: th.Tensor, target_q: th.Tensor) -> th.Tensor:
         q_values = self.critic.q_values(self.critic.encode(trunk), actions)
+        return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
+
+    def _joint_critic_loss(
+        self, trunk: Trunk, batch: ReplayBufferSamples, discounts: th.Tensor | float, ent_coef: th.Tensor
+    ) -> th.Tensor:
+        """CrossQ's: both states in one batch, so that batch norm sees what it is used on; targets need no other networks."""
+        latent = self.critic.encode(trunk)
+        with th.no_grad():
+            next_actions, next_log_prob = self._act(batch.next_observations)
+            next_latent = self.critic.encode(batch.next_observations)
+        with self.critic.batch_statistics():
+            both = self.critic.q_values(th.cat([latent, next_latent]), th.cat([batch.actions, next_actions]))
+        q_values, next_q_values = zip(*(q.chunk(2) for q in both), strict=True)
+        next_q = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True)[0] - ent_coef * next_log_prob
+        target_q = (batch.rewards + (1 - batch.dones) * discounts * next_q).detach()
         return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
 
     def _actor_loss(self, observations: PyTorchObs, actions: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:

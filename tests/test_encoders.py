@@ -190,6 +190,13 @@ def test_simba_is_its_formula() -> None:
     th.testing.assert_close(encoder(x), F.layer_norm(h, (4,), last.weight, last.bias))
 
 
+def test_the_observation_beside_the_latent_state() -> None:
+    encoder = SimbaEncoder(spaces.Box(-1, 1, (3,)), 4, observation=True).eval()
+    x = th.randn(5, 3)
+    assert encoder.features_dim == 7 and th.equal(encoder(x)[:, 4:], encoder.normalization(x))
+    assert th.equal(encoder(x)[:, :4], encoder.layers(encoder.normalization(x)))
+
+
 def test_running_statistics_are_those_of_the_batches() -> None:
     """Those of all observations of up to a thousand batches; where no gradient is computed nothing is learnt."""
     norm, batches = RunningNorm(2), [th.randn(5, 2) * 3 + i for i in range(20)]

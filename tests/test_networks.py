@@ -1,67 +1,80 @@
-"""Hidden layers of actor and critics against their formulas, and in a policy that is saved."""
+"""Q networks with layer norm and batch norm: against their formulas, and in a policy that is trained and saved."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch as th
+from test_sac_aux import assert_same, everything, filled_model, make_model
 from torch import nn
 from torch.nn import functional as F
 
 from sb3_aarl import SACAux
-from sb3_aarl.networks import hidden_layers
+from sb3_aarl.networks import q_network
 
 
-def naive(network: str, layers: nn.Sequential, x: th.Tensor) -> th.Tensor:
-    """Two hidden layers of one width, from their parameters alone."""
-    parameters = list(layers.parameters())
-
-    def take(function: Any, x: th.Tensor) -> th.Tensor:
-        weight, bias = parameters.pop(0), parameters.pop(0)
-        return function(x, weight.shape, weight, bias) if function is F.layer_norm else function(x, weight, bias)
-
-    if network == "simba":
-        x = take(F.linear, x)
-        for _ in range(2):
-            x = x + take(F.linear, take(F.linear, take(F.layer_norm, x)).relu())
-        return take(F.layer_norm, x)
-    for _ in range(2):
-        x = take(F.linear, x)
-        x = (take(F.layer_norm, x) if network == "layer_norm" else x).relu()
-    assert not parameters
-    return x
-
-
-@pytest.mark.parametrize("network", ["mlp", "layer_norm", "simba"])
-def test_hidden_layers_are_their_formula(network: str) -> None:
-    layers = hidden_layers(network, 3, [4, 4], nn.ReLU)
-    for parameter in layers.parameters():
+@pytest.mark.parametrize("norm", [None, "layer", "batch"])
+def test_q_networks_are_their_formula(norm: str | None) -> None:
+    network = q_network(norm, 3, [4, 5], nn.ReLU)
+    for parameter in network.parameters():
         nn.init.normal_(parameter)
-    x = th.randn(5, 3)
-    th.testing.assert_close(layers(x), naive(network, layers, x))
+    parameters, h = iter(network.parameters()), th.randn(6, 3)
+    x = h
+
+    def normalized(h: th.Tensor) -> th.Tensor:
+        dim, eps = (0, 1e-3) if norm == "batch" else (1, 1e-5)
+        h = (h - h.mean(dim, keepdim=True)) / (h.var(dim, keepdim=True, unbiased=False) + eps).sqrt()
+        return h * next(parameters) + next(parameters)
+
+    for layer in range(3):
+        h = normalized(h) if norm == "batch" else h
+        h = F.linear(h, next(parameters), next(parameters))
+        h = normalized(h) if norm == "layer" and layer < 2 else h
+        h = h.relu() if layer < 2 else h
+    th.testing.assert_close(network(x), h)
 
 
-def test_widths_of_blocks_may_differ() -> None:
-    assert hidden_layers("simba", 3, [8, 8, 4], nn.ReLU)(th.zeros(2, 3)).shape == (2, 4)
-
-
-@pytest.mark.parametrize("network", ["simba", {"pi": "mlp", "qf": "layer_norm"}], ids=str)
-@pytest.mark.parametrize("use_sde", [False, True])
-def test_networks_of_a_policy(network: Any, use_sde: bool, tmp_path: Path) -> None:
-    policy_kwargs = {"net_arch": [8, 8], "network": network}
-    model = SACAux("MlpPolicy", "Pendulum-v1", 1e-2, learning_starts=10, use_sde=use_sde, policy_kwargs=policy_kwargs)
-    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
-    model.learn(20)
-    actor, critic = (network, network) if isinstance(network, str) else (network["pi"], network["qf"])
-    wanted = {"mlp": 0, "layer_norm": 2, "simba": 3}
-    for layers, kind in ((model.actor.latent_pi, actor), (model.critic.qf0, critic), (model.critic_target.qf1, critic)):
-        assert sum(isinstance(layer, nn.LayerNorm) for layer in layers.modules()) == wanted[kind]
-    assert all(not th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+@pytest.mark.parametrize("norm", ["layer", "batch"])
+@pytest.mark.parametrize("settings", [{}, {"use_sde": True, "n_steps": 3}], ids=str)
+def test_a_policy_with_norms_is_trained_and_saved(norm: str, settings: dict[str, Any], tmp_path: Path) -> None:
+    model = make_model(policy_kwargs={"critic_norm": norm}, **settings)
+    before = everything(model)
+    model.learn(60)
+    assert all(not th.equal(value, before[name]) for name, value in model.critic.state_dict(prefix="policy.critic.").items())
     model.save(tmp_path / "model")
-    loaded = SACAux.load(tmp_path / "model").policy.state_dict()
-    assert all(th.equal(value, loaded[name]) for name, value in model.policy.state_dict().items())
+    assert_same(everything(SACAux.load(tmp_path / "model")), everything(model))
 
 
-def test_an_unknown_network_is_named() -> None:
-    with pytest.raises(ValueError, match="unknown network 'resnet', expected one of mlp, layer_norm, simba"):
-        SACAux("MlpPolicy", "Pendulum-v1", policy_kwargs={"network": "resnet"})
+def test_batch_norm_sees_both_states_and_needs_no_target_networks() -> None:
+    model = filled_model(policy_kwargs={"critic_norm": "batch"})
+    for _ in range(3):
+        model.train(1, batch_size=16)
+    batch, ent_coef = model.replay_buffer.sample(16), th.tensor(0.1)
+    for parameter in (p for network in model.critic_target.q_networks for p in network.parameters()):
+        parameter.data.fill_(th.nan)
+    running = model.critic.qf0[0].running_mean.clone()
+    th.manual_seed(1)
+    loss = model._joint_critic_loss(model.critic.trunk(batch.observations), batch, 0.9, ent_coef)
+    assert not th.equal(running, model.critic.qf0[0].running_mean)
+
+    th.manual_seed(1)
+    next_actions, next_log_prob = model.actor.action_log_prob(batch.next_observations)
+    latent = th.cat([model.critic.encode(batch.observations), model.critic.encode(batch.next_observations)])
+    x = th.cat([latent, th.cat([batch.actions, next_actions])], dim=1)
+    values = []
+    for network in model.critic.q_networks:
+        h = x
+        for layer in network:
+            if isinstance(layer, nn.BatchNorm1d):
+                h = F.batch_norm(h, None, None, layer.weight, layer.bias, training=True, eps=1e-3)
+            else:
+                h = layer(h)
+        values.append(h[:, 0])
+    now, later = th.stack(values)[:, :16], th.stack(values)[:, 16:]
+    wanted = batch.rewards[:, 0] + 0.9 * (1 - batch.dones[:, 0]) * (later.amin(0) - ent_coef * next_log_prob)
+    th.testing.assert_close(loss, 0.5 * (now - wanted).pow(2).mean(1).sum())
+
+
+def test_an_unknown_norm_is_refused() -> None:
+    with pytest.raises(ValueError, match="unknown critic_norm 'group', expected one of None, layer, batch"):
+        make_model(policy_kwargs={"critic_norm": "group"})
