@@ -1,14 +1,49 @@
 """AuxHead: source tokens -> predictor -> operator <- target tokens through the momentum encoder."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch as th
-from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_aarl.aux_loss import AuxLoss, Token
 from sb3_aarl.buffers import WindowSamples, map_parts
 from sb3_aarl.operators import Operator
+
+
+@dataclass(frozen=True)
+class AuxOptions:
+    """
+    How the auxiliary loss is trained: the keys of ``SACAux(aux_kwargs=...)``.
+
+    :param learning_rate: Of its optimizer, may be a schedule; None for SACAux's ``learning_rate``
+    :param batch_size: Windows for each update, None for SACAux's ``batch_size``
+    :param tau: Polyak coefficient of the momentum encoder (paper, table 7)
+    :param predictor_width: Hidden units of the predictor (paper, table 7), None for twice its input (the public reference)
+    :param joint: Whether one optimizer trains the encoder on the weighted sum of critic and auxiliary loss (equation 1).
+        By default the auxiliary loss has an optimizer of its own for encoder and predictor, as in CURL
+    :param coef: Weight lambda of the auxiliary loss in that sum; for ``joint`` alone, since an Adam of its own divides a
+        constant factor out again
+    """
+
+    learning_rate: float | Schedule | None = None
+    batch_size: int | None = None
+    tau: float = 0.05
+    predictor_width: int | None = 256
+    joint: bool = False
+    coef: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "predictor_width"):
+            if getattr(self, name) is not None and not getattr(self, name) >= 1:
+                raise ValueError(f"aux_kwargs: {name} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.tau <= 1:
+            raise ValueError(f"aux_kwargs: tau must be between 0 and 1, not {self.tau}")
+        if not 0 <= self.coef < float("inf"):
+            raise ValueError(f"aux_kwargs: coef must be a finite number of at least 0, not {self.coef}")
+        if self.coef != 1 and not self.joint:
+            raise ValueError("aux_kwargs: coef has no effect without joint=True")
 
 
 class AuxHead(nn.Module):

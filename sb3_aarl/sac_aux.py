@@ -8,7 +8,6 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -25,7 +24,7 @@ from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_
 from torch.nn import functional as F
 
 from sb3_aarl import catalog
-from sb3_aarl.aux_head import AuxHead
+from sb3_aarl.aux_head import AuxHead, AuxOptions
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
 from sb3_aarl.health import NonFiniteError, QValueCheck, check_finite
@@ -43,40 +42,6 @@ def _computes_bf16(device: th.device) -> bool:
     if device.type == "cuda":
         return th.cuda.is_bf16_supported(including_emulation=False)
     return device.type != "cpu" or th.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
-
-
-@dataclass(frozen=True)
-class AuxOptions:
-    """
-    How the auxiliary loss is trained: the keys of ``SACAux(aux_kwargs=...)``.
-
-    :param learning_rate: Of its optimizer, may be a schedule; None for SACAux's ``learning_rate``
-    :param batch_size: Windows for each update, None for SACAux's ``batch_size``
-    :param tau: Polyak coefficient of the momentum encoder (paper, table 7)
-    :param predictor_width: Hidden units of the predictor (paper, table 7), None for twice its input (the public reference)
-    :param joint: Whether one optimizer trains the encoder on the weighted sum of critic and auxiliary loss (equation 1).
-        By default the auxiliary loss has an optimizer of its own for encoder and predictor, as in CURL
-    :param coef: Weight lambda of the auxiliary loss in that sum; for ``joint`` alone, since an Adam of its own divides a
-        constant factor out again
-    """
-
-    learning_rate: float | Schedule | None = None
-    batch_size: int | None = None
-    tau: float = 0.05
-    predictor_width: int | None = 256
-    joint: bool = False
-    coef: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("batch_size", "predictor_width"):
-            if getattr(self, name) is not None and not getattr(self, name) >= 1:
-                raise ValueError(f"aux_kwargs: {name} must be at least 1, not {getattr(self, name)}")
-        if not 0 <= self.tau <= 1:
-            raise ValueError(f"aux_kwargs: tau must be between 0 and 1, not {self.tau}")
-        if not 0 <= self.coef < float("inf"):
-            raise ValueError(f"aux_kwargs: coef must be a finite number of at least 0, not {self.coef}")
-        if self.coef != 1 and not self.joint:
-            raise ValueError("aux_kwargs: coef has no effect without joint=True")
 
 
 class SACAux(SAC):
