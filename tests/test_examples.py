@@ -1,6 +1,6 @@
 """The scripts in examples/ run as they are, with fewer steps."""
 
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -23,8 +23,10 @@ def test_all_are_here() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAST)
-def test_example(name: str, tmp_path: Path) -> None:
-    command = [sys.executable, EXAMPLES / f"{name}.py", "--steps", "230"]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines()[-1].startswith(LAST[name]), result.stdout
+def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.setenv("PYTHONPATH", "")  # which one of them sets
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--steps", "230"])
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    assert capsys.readouterr().out.splitlines()[-1].startswith(LAST[name])
