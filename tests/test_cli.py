@@ -165,18 +165,10 @@ def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(name: str, monke
     ("environment", "options", "message"),
     [
         ("Pendulum-v1", "--cpus-per-run 8", "--cpus-per-run has no meaning with --executor local"),
-        ("Pendulum-v1", "--ray-address auto", "--ray-address has no meaning with --executor local"),
         ("Pendulum-v1", "--executor ray --slurm mem_gb=4", "--slurm has no meaning with --executor ray"),
         ("CartPole-v1", "", "CartPole-v1 cannot be trained"),
-        ("Pendulum-v1\nstages: 3", "", "small.yml: stages"),
-        (
-            "Pendulum-v1\noverrides: {train_freq: 0}",
-            "",
-            "small.yml: Pendulum-v1: train_freq must be a positive number of steps",
-        ),
         ("Pendulum-v1\noverrides: {train_freq: [1, episode], n_envs: 2}", "", "small.yml: Pendulum-v1 cannot be trained"),
         ("Pendulum-v1\noverrides: {stats_window_size: -1}", "--dry-run", "small.yml: Pendulum-v1 cannot be trained"),
-        ("Pendulum-v1\noverrides: {policy_kwargs: {n_critics: 0}}", "", "small.yml: Pendulum-v1 cannot be trained"),
     ],
     ids=str,
 )

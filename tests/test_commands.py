@@ -113,12 +113,6 @@ def test_shipped_files_have_names(name: str, searches: bool, file: str) -> None:
     assert find_file(Path(name), searches) == ZOO / file
 
 
-def test_every_shipped_file_is_found_by_its_last_name() -> None:
-    for searches in (False, True):
-        for path in shipped_files(searches).values():
-            assert find_file(Path(path.stem), searches) == path
-
-
 def test_a_file_that_is_there_wins(folder: Path) -> None:
     (folder / "sac").mkdir()  # a folder is none
     assert find_file(Path("sac")) == ZOO / "sac.yml"
@@ -132,9 +126,7 @@ def test_a_file_that_is_there_wins(folder: Path) -> None:
     ("arguments", "nearest"),
     [
         ("search dmo", "demo"),
-        ("baselines cheetah_run_sate", "cheetah_run_state"),
         ("benchmark arl_state --envs cheetah-run", "aarl_state"),
-        ("train cheetah-run --hyperparams paper/sac_pixl", "paper/sac_pixel"),
     ],
 )
 def test_an_unknown_name_has_the_nearest(arguments: str, nearest: str) -> None:

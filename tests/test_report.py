@@ -60,7 +60,8 @@ def study():
         trial = make_trial(number, state, value, 60 + number, **attrs)
         trial.user_attrs["loss"] = str(random_loss(np.random.default_rng(number), 3))
         study.add_trial(trial)
-    study.set_user_attr("settings", {"environment": EVIL})
+    stored = {"environment": EVIL, "checkpoints": [2000, 40000], "evaluation_episodes": 3, "seeds": [0, 1]}
+    study.set_user_attr("settings", stored)
     return study
 
 
@@ -112,10 +113,15 @@ def test_hours_of_interrupted_trials_are_not_known():
 
 
 @pytest.fixture(scope="module")
-def page(study, tmp_path_factory):
-    """Its report."""
+def path(study, tmp_path_factory):
+    """The file of its report."""
     path = tmp_path_factory.mktemp("report") / "deep" / "report.html"
     write_report(study, path, [("SAC & co", 150.0)])
+    return path
+
+
+@pytest.fixture
+def page(path):
     return read_page(path)
 
 
@@ -139,7 +145,9 @@ def test_what_the_report_says(study, page):
     assert parents and [row[1] for row in table_after(page, "Lineage of the best")] == parents
     assert len(table_after(page, "Patterns")) == 8
     assert f"Best so far: {best[0].value:.2f}" in text and "Baselines: SAC & co 150.00" in text
-    assert table_after(page, "Settings") == [["environment", EVIL]]
+    assert table_after(page, "Settings") == [[name, str(value)] for name, value in study.user_attrs["settings"].items()]
+    assert f"trained on {EVIL} and evaluated at 2,000, 40,000 environment steps with 3 episodes." in text
+    assert "mean of 2 runs" in text
     assert dict(table_after(page, "What wrote this report")).keys() >= {"commit", "cpu", "versions"}
     versions = Counter(trial.user_attrs["versions"] for trial in study.trials if "versions" in trial.user_attrs)
     assert dict(table_after(page, "Versions of packages, by trials")) == {name: str(n) for name, n in versions.items()}
@@ -200,29 +208,14 @@ def test_baselines_and_cross_validation_are_read_from_their_folders(tmp_path):
     assert "Cross-validation" not in read_page(tmp_path / "report.html").text_content()
 
 
-def test_settings_are_those_stored_with_the_study(tmp_path):
-    study = optuna.create_study(direction="maximize")
-    study.add_trial(make_trial(0, TrialState.COMPLETE, 1.0, 1))
-    stored = {"environment": "Pendulum-v1", "checkpoints": [2000, 40000], "evaluation_episodes": 3, "seeds": [0, 1]}
-    study.set_user_attr("settings", stored)
-    write_report(study, tmp_path / "report.html")
-    page = read_page(tmp_path / "report.html")
-    assert ["checkpoints", "[2000, 40000]"] in table_after(page, "Settings")
-    text = " ".join(page.text_content().split())
-    assert "trained on Pendulum-v1 and evaluated at 2,000, 40,000 environment steps with 3 episodes." in text
-    assert "mean of 2 runs" in text
-
-
-@pytest.mark.parametrize("curves", [{}, {"curve": [[1, 1.0, 0.0]]}])
-def test_report_of_scores_that_are_all_alike(tmp_path, curves):
+def test_report_of_scores_that_are_all_alike(tmp_path):
     study = optuna.create_study(study_name="a $x_{ $ b", direction="maximize")
     for number in range(4):
-        attrs = curves if number % 2 else {key: [[2, 1.0, 0.0]] for key in curves}
-        study.add_trial(make_trial(number, TrialState.COMPLETE, 1.0, 1, **attrs))
+        study.add_trial(make_trial(number, TrialState.COMPLETE, 1.0, 1, curve=[[1 + number % 2, 1.0, 0.0]]))
     write_report(study, tmp_path / "report.html")
     text = " ".join(read_page(tmp_path / "report.html").text_content().split())
     assert "importances need different scores; there are 4 complete trials, all alike." in text
-    assert ("their learning curves cannot be compared." if curves else "no complete trial has a learning curve.") in text
+    assert "their learning curves cannot be compared." in text
 
 
 @pytest.mark.parametrize("states", [[], [TrialState.FAIL, TrialState.RUNNING]])
@@ -250,10 +243,8 @@ def test_report_of_another_sampler(tmp_path):
 
 
 @pytest.mark.slow
-def test_in_a_real_browser(study, tmp_path):
-    path = tmp_path / "report.html"
+def test_in_a_real_browser(study, path, tmp_path):
     best = completed(study)
-    write_report(study, path, [("SAC", 150.0), ("CURL", 180.0)])
     with open_browser(tmp_path / "profile") as browser:
         browser.get(path.as_uri())
         assert browser.title.startswith("study <script>")

@@ -47,15 +47,15 @@ def live() -> Iterator[Callable[[str, object], None]]:
     if errors.is_terminal:
         with Live(console=errors, refresh_per_second=2) as display:
             # What is longer than the terminal is wide would be cut.
-            yield lambda shown, state: display.update(shown.replace("; ", "\n"))
+            yield lambda line, state: display.update(line.replace("; ", "\n"))
         return
-    last: object = None
-    shown = -LINE_SECONDS
+    last_state: object = None
+    last_time = -LINE_SECONDS
 
     def show(line: str, state: object) -> None:
-        nonlocal last, shown
-        if state != last or time.monotonic() - shown > LINE_SECONDS:
-            last, shown = state, time.monotonic()
+        nonlocal last_state, last_time
+        if state != last_state or time.monotonic() - last_time > LINE_SECONDS:
+            last_state, last_time = state, time.monotonic()
             errors.print(f"{datetime.now():%H:%M:%S} {line}", markup=False, highlight=False)
 
     yield show
@@ -99,18 +99,18 @@ def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
         say("All runs are finished.")
         return
     say(f"Measuring some seconds of each kind of run ({len(kinds)}) ...")
-    found = costs(kinds)
+    measured = costs(kinds)
     formats = dict.fromkeys(("runs", "environment steps", "gradient steps"), "{:,}")
     formats |= dict.fromkeys(("ms an environment step", "ms a gradient step", "hours of a run", "core hours"), "{:.2g}")
     formats["MB of buffer"] = "{:,.1f}"
-    shown = pd.DataFrame({name: found[name].map(text.format) for name, text in formats.items()})
-    shown.columns = shown.columns.str.replace(" ", "\n")
-    shown.insert(0, "", list(kinds))
-    show_table(shown, "Measured here")
-    n_runs = found["runs"].sum()
-    hours = (found["runs"] * found["hours of a run"]).sum() / min(workers, n_runs)
-    memory = found["MB of buffer"].max() * min(workers, n_runs)
+    table = pd.DataFrame({name: measured[name].map(text.format) for name, text in formats.items()})
+    table.columns = table.columns.str.replace(" ", "\n")
+    table.insert(0, "", list(kinds))
+    show_table(table, "Measured here")
+    n_runs = measured["runs"].sum()
+    hours = (measured["runs"] * measured["hours of a run"]).sum() / min(workers, n_runs)
+    memory = measured["MB of buffer"].max() * min(workers, n_runs)
     say(
-        f"All: {n_runs} runs, {found['core hours'].sum():.2g} core hours; {hours:.2g} hours and at most {memory:,.1f} MB of "
-        f"buffers with --workers {workers}. Starting each takes some seconds more. Nothing was started."
+        f"All: {n_runs} runs, {measured['core hours'].sum():.2g} core hours; {hours:.2g} hours and at most {memory:,.1f} MB "
+        f"of buffers with --workers {workers}. Starting each takes some seconds more. Nothing was started."
     )

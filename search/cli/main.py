@@ -1,4 +1,4 @@
-"""The program ``aarl``. What the commands do lies elsewhere; imports that take seconds are made when they are needed."""
+"""The program ``aarl``. Imports that take seconds are made in the commands that need them."""
 
 import logging
 import signal
@@ -11,9 +11,9 @@ from sb3_aarl.search.cli import matrices, results, search, train
 from sb3_aarl.search.cli.console import errors
 from typer.core import TyperGroup
 
-# Training alone does without these modules; the extra that has them.
+# The extras of modules that training does not need.
 EXTRAS = {"imageio": "search", "psycopg": "postgres", "ray": "ray", "submitit": "slurm"}
-OF_SEARCH = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "scipy", "sklearn", "sqlalchemy", "tenacity")
+SEARCH_MODULES = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "scipy", "sklearn", "sqlalchemy", "tenacity")
 
 
 class Program(TyperGroup):
@@ -42,7 +42,7 @@ def explain(error: Exception) -> str | None:
         line = f"{error.filename}: {error.strerror}"
     if isinstance(error, ModuleNotFoundError):
         module = (error.name or "").partition(".")[0]
-        extra = "search" if module in OF_SEARCH else EXTRAS.get(module)
+        extra = "search" if module in SEARCH_MODULES else EXTRAS.get(module)
         return extra and f"{line}: pip install 'sb3-aarl[{extra}]'"
     if "gymnasium" in sys.modules:
         from gymnasium.error import Error

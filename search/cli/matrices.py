@@ -62,11 +62,11 @@ def exit_if_failed(matrix: "Matrix") -> None:
     from sb3_aarl.search.training.folder import read_outcome
 
     outcomes = {cell: read_outcome(cell_folder(matrix.folder, cell)) for cell in matrix.runs}
-    found = {cell: outcome.failure for cell, outcome in outcomes.items() if outcome and outcome.failure is not None}
-    for cell, reason in found.items():
+    reasons = {cell: outcome.failure for cell, outcome in outcomes.items() if outcome and outcome.failure is not None}
+    for cell, reason in reasons.items():
         line = f"Failed: {cell.variant} on {cell.environment}, seed {cell.seed}: {reason}"
         errors.print(line, style="red", markup=False, highlight=False)
-    if found:
+    if reasons:
         raise typer.Exit(1)
 
 
@@ -78,13 +78,13 @@ def baselines(
     from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
     from sb3_aarl.search.studies import search
 
-    found = search.Search.from_file(config, folder, threads=threads)
-    settings = found.config
+    searched = search.Search.from_file(config, folder, threads=threads)
+    settings = searched.config
     if not settings.baselines:
         raise ValueError(f"{config} names no baselines")
-    if (found.folder / STUDY_FILE).exists():
-        search.check_study(load_study(open_storage(found.folder), settings.name), settings, free=("threads",))
-    matrix = search.baselines(settings, found.folder)
+    if (searched.folder / STUDY_FILE).exists():
+        search.check_study(load_study(open_storage(searched.folder), settings.name), settings, free=("threads",))
+    matrix = search.baselines(settings, searched.folder)
     train_matrix(matrix, workers, settings.retries, config)
     compare(matrix, "Baselines, AULC", json)
     exit_if_failed(matrix)

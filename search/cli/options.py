@@ -63,9 +63,9 @@ def search_folder(folder: Path | None, storage: str | None) -> Path | None:
     from sb3_aarl.search.execution.storage import STUDY_FILE
 
     if folder is not None:
-        named = run_folder(folder, None)
-        is_config = folder.suffix.lower() in (".yml", ".yaml") or (not folder.exists() and named.exists())
-        return named if is_config else folder
+        default = run_folder(folder, None)
+        is_config = folder.suffix.lower() in (".yml", ".yaml") or (not folder.exists() and default.exists())
+        return default if is_config else folder
     if storage is not None:
         return None
     folders = sorted(path.parent for path in Path("runs").glob(f"*/{STUDY_FILE}"))
@@ -79,13 +79,13 @@ def open_studies(folders: Sequence[Path | None] | None, storage: str | None) -> 
     """Studies and their folders by name; by folder where names are alike."""
     from sb3_aarl.search.execution.storage import load_study, open_storage
 
-    found = {}
+    studies = {}
     for folder in folders or [None]:
         path = search_folder(folder, storage)
         opened = open_storage(path, storage, create=False)
         # The file in a folder has one study; of those in a database it is the one with the folder's name.
         is_shared = storage is not None or len(opened.get_all_studies()) > 1
         study = load_study(opened, path.name if path is not None and is_shared else None)
-        found[path or Path("runs") / study.study_name] = study
-    alike = len({study.study_name for study in found.values()}) < len(found)
-    return {str(path) if alike else study.study_name: (study, path) for path, study in found.items()}
+        studies[path or Path("runs") / study.study_name] = study
+    alike = len({study.study_name for study in studies.values()}) < len(studies)
+    return {str(path) if alike else study.study_name: (study, path) for path, study in studies.items()}

@@ -70,8 +70,8 @@ def analyze(
 
     patterns = {**analysis.PATTERNS, **{text: text for text in pattern or ()}}
     summaries = {
-        name: analysis.summary(found.get_trials(deepcopy=False), found.direction, patterns)
-        for name, (found, _) in open_studies(folders, storage).items()
+        name: analysis.summary(study.get_trials(deepcopy=False), study.direction, patterns)
+        for name, (study, _) in open_studies(folders, storage).items()
     }
     if json:
         data = {
@@ -127,11 +127,12 @@ def status(
         )
         lines.append(f"Search: best {best}; {how}")
     for part in ("", *PARTS):
-        found, to_go = matrix_status(path / part)
-        if not found.empty:
-            data[part or "benchmark"] = {"variants": records(found.set_index("variant")), "seconds_to_go": to_go}
-            tables[part or "benchmark"] = found.assign(score=found["score"].map("{:.2f}".format).replace("nan", "-"))
-            lines.append(f"{(part or 'benchmark').capitalize()}: {time_to_go(to_go)}")
+        variants, to_go = matrix_status(path / part)
+        if not variants.empty:
+            name = part or "benchmark"
+            data[name] = {"variants": records(variants.set_index("variant")), "seconds_to_go": to_go}
+            tables[name] = variants.assign(score=variants["score"].map("{:.2f}".format).replace("nan", "-"))
+            lines.append(f"{name.capitalize()}: {time_to_go(to_go)}")
     if not tables:
         raise ValueError(f"{path} has neither a search nor a benchmark. aarl search starts one")
     if json:

@@ -48,10 +48,10 @@ def search(
     dry_run: DryRun = False,
 ) -> None:
     """Search for losses by evolution. Ctrl-C stops it, the same command resumes it."""
-    named = {"--ray-address": ray_address, "--slurm": slurm, "--cpus-per-run": cpus_per_run, "--gpus-per-run": gpus_per_run}
-    foreign = {"local": set(named), "ray": {"--slurm"}, "slurm": {"--ray-address"}}[executor]
-    for name in foreign:
-        if named[name] is not None:
+    values = {"--ray-address": ray_address, "--slurm": slurm, "--cpus-per-run": cpus_per_run, "--gpus-per-run": gpus_per_run}
+    meaningless = {"local": set(values), "ray": {"--slurm"}, "slurm": {"--ray-address"}}[executor]
+    for name in meaningless:
+        if values[name] is not None:
             raise ValueError(f"{name} has no meaning with --executor {executor}")
 
     from optuna import logging
@@ -87,7 +87,7 @@ def search(
 
         running = LocalExecutor(at_once)
     with running, live() as show:
-        progress = found.run(running, at_once, lambda shown: show(progress_line(shown), shown.generations))
+        progress = found.run(running, at_once, lambda state: show(progress_line(state), state.generations))
     if progress.best is not None:
         say(f"Best: {progress.best_loss}, score {progress.best:.2f}")
         if settings.cross_validation:

@@ -84,13 +84,13 @@ def losses(
     from sb3_aarl import catalog
 
     names = [*catalog.names(), *(candidate.name for candidate in catalog.published() if published)]
-    found = {name: catalog.load(name) for name in names}
+    named = {name: catalog.load(name) for name in names}
     if json:
-        say_json({name: str(loss) for name, loss in found.items()})
+        say_json({name: str(loss) for name, loss in named.items()})
         return
     table = Table("name", "notation")
     table.columns[1].overflow = "fold"
-    for name, loss in found.items():
+    for name, loss in named.items():
         table.add_row(name, escape(str(loss)))
     console.print(table)
 
@@ -101,14 +101,14 @@ def configs(json: Json = False) -> None:
     from sb3_aarl.search.training.shipped import shipped_files
 
     kinds = {"Hyper-parameters: aarl train --hyperparams NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
-    found = {
+    files = {
         title: {name: first_sentence(path) for name, path in shipped_files(searches).items()}
         for title, searches in kinds.items()
     }
     if json:
-        say_json({title.partition(":")[0].lower(): names for title, names in found.items()})
+        say_json({title.partition(":")[0].lower(): names for title, names in files.items()})
         return
-    for title, names in found.items():
+    for title, names in files.items():
         table = Table("name", "what it is", title=title, title_justify="left")
         table.columns[0].no_wrap = True
         for row in names.items():

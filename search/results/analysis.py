@@ -67,7 +67,7 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
 
 
 def ranked(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
-    """The trials that have a score, the best first; of equals those with lower numbers."""
+    """The trials that have a score, the best first; ties are ordered by trial number."""
     return table.dropna(subset="score").sort_values("score", ascending=direction == StudyDirection.MINIMIZE, kind="stable")
 
 
@@ -132,7 +132,7 @@ def pattern_scores(
 
 def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS) -> pd.DataFrame:
     """
-    Whether losses with a pattern score otherwise than those without it (paper, section 3.3, table 5).
+    Whether losses with a pattern have other scores than those without it (paper, section 3.3, table 5).
 
     All analysed trials of all generations are one sample, as in the paper. They are not independent: candidates descend from
     each other, and later generations score higher and have other patterns. So p-values are lower than those of an
@@ -258,14 +258,14 @@ def leaders(table: pd.DataFrame, top: int = 10) -> pd.DataFrame:
 
 def lineage(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
     """The best trial and all its ancestors, the latest first; ``gain`` is the score less that of the best parent."""
-    wanted = set(ranked(table, direction)["number"][:1])
-    for number in range(max(wanted, default=-1), -1, -1):
-        if number in wanted:
-            wanted |= set(table["parents"][number])
-    line = table.loc[sorted(wanted, reverse=True)].set_index("number")
-    best_of = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
-    parents = [best_of(table["score"][numbers]) if numbers else np.nan for numbers in line["parents"]]
-    line["gain"] = line["score"] - np.array(parents, dtype=float)
+    numbers = set(ranked(table, direction)["number"][:1])
+    for number in range(max(numbers, default=-1), -1, -1):
+        if number in numbers:
+            numbers |= set(table["parents"][number])
+    line = table.loc[sorted(numbers, reverse=True)].set_index("number")
+    best = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
+    before = [best(table["score"][parents]) if parents else np.nan for parents in line["parents"]]
+    line["gain"] = line["score"] - np.array(before, dtype=float)
     line["loss"] = [None if loss is None else str(loss) for loss in line["loss"]]
     return line[["generation", "operation", "parents", "score", "gain", "loss"]]
 

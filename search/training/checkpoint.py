@@ -97,9 +97,10 @@ def load(model: SACAux, state: Mapping[str, Any]) -> None:
 
 def _statistics(env: VecNormalize | None) -> dict[str, Any]:
     """VecNormalize's running statistics by name; Dict observations have those of each key."""
-    found = {name: getattr(env, name) for name in ("obs_rms", "ret_rms") if hasattr(env, name)}
-    parts = found["obs_rms"] if isinstance(found.get("obs_rms"), dict) else {}
-    return found if not parts else {"ret_rms": found["ret_rms"]} | {f"obs_rms/{key}": part for key, part in parts.items()}
+    statistics = {name: getattr(env, name) for name in ("obs_rms", "ret_rms") if hasattr(env, name)}
+    if isinstance(statistics.get("obs_rms"), dict):
+        statistics |= {f"obs_rms/{key}": part for key, part in statistics.pop("obs_rms").items()}
+    return statistics
 
 
 def remove(folder: Path) -> None:

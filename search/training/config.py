@@ -46,7 +46,7 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
 
 
 def entry_of(entries: Mapping[str, Any], env_id: str, source: str) -> dict[str, Any]:
-    """The hyper-parameters of an environment in what a file of them has."""
+    """The hyper-parameters of an environment in the contents of a file."""
     if not {"default", env_id} & entries.keys():
         hint = ": it is the file of a search" if "environment" in entries else ", under which hyper-parameters are expected"
         raise ConfigError(f"{source}: neither {env_id!r} nor 'default' is there{hint}")
@@ -73,14 +73,14 @@ def env_wrappers(value: Any) -> list[tuple[type[gym.Wrapper], dict[str, Any]]]:
     Class and arguments of each wrapper of ``env_wrapper``, the innermost first: a name such as
     ``gymnasium.wrappers.ClipAction``, a mapping from one name to arguments, or a list of both.
     """
-    found = []
+    wrappers = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:
         ((name, arguments),) = item.items() if isinstance(item, Mapping) and len(item) == 1 else [(item, {})]
         kind = pydoc.locate(str(name))
         if not (isinstance(kind, type) and issubclass(kind, gym.Wrapper) and isinstance(arguments, Mapping | None)):
             raise ValueError(f"must name a gymnasium.Wrapper that can be imported, or map one to its arguments, not {item!r}")
-        found.append((kind, dict(arguments or {})))
-    return found
+        wrappers.append((kind, dict(arguments or {})))
+    return wrappers
 
 
 def action_repeat(hyperparameters: Mapping[str, Any]) -> int:
@@ -96,15 +96,15 @@ def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
 
 
 def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, Any], source: str) -> None:
-    """Every checkpoint has to be the end of a rollout."""
+    """Check that every checkpoint is the end of a rollout."""
     train_freq = hyperparameters.get("train_freq", 1)
     number, unit = (train_freq, "step") if isinstance(train_freq, int) else train_freq
     if number < 1 or (unit == "episode" and number > 1):
         raise ConfigError(f"{source}: train_freq must be a positive number of steps or 1 episode, not {train_freq}")
     interval = checkpoint_interval(hyperparameters)
     if between := [steps for steps in sorted(checkpoints) if steps % interval]:
-        of_what = f"{interval} (train_freq x n_envs x action repeat)"
-        raise ConfigError(f"{source}: checkpoints must be multiples of {of_what}, {between} are not")
+        rollout = f"{interval} (train_freq x n_envs x action repeat)"
+        raise ConfigError(f"{source}: checkpoints must be multiples of {rollout}, {between} are not")
 
 
 def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int = 1) -> tuple[int, ...]:

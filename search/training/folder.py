@@ -74,9 +74,9 @@ def prepare_run(folder: Path, run: Run) -> None:
             free.append("checkpoints")
         for key, ours, theirs in differences(values, stored):
             if key not in free:
-                there, here = ("not set" if value is None else repr(value) for value in (theirs, ours))
+                old, new = ("not set" if value is None else repr(value) for value in (theirs, ours))
                 raise ValueError(
-                    f"{folder} has another run: {key} is {there} there, {here} here. Choose another folder (--folder)"
+                    f"{folder} has another run: {key} is {old} there, {new} here. Choose another folder (--folder)"
                 )
     replace_text(folder / RUN, json.dumps(values, indent=1) + "\n")
     for name in (STOP, FAILED):

@@ -57,11 +57,11 @@ def cpu() -> str:
 @functools.cache
 def versions() -> str:
     """Versions of the installed packages that results depend on."""
-    found = []
+    installed = []
     for package in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
-            found.append(f"{package} {metadata.version(package)}")
-    return ", ".join(found)
+            installed.append(f"{package} {metadata.version(package)}")
+    return ", ".join(installed)
 
 
 def hide_password(text: str) -> str:

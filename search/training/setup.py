@@ -92,8 +92,8 @@ class Setup:
             settings["compile"] = False
         self.settings = _with_schedules(settings) | {"aux_loss": run.aux_loss, "seed": run.seed}
 
-        of_dmc = run.environment.startswith(PREFIX)
-        limits = [EPISODE_LENGTH if of_dmc else gym.spec(run.environment).max_episode_steps]
+        is_dmc = run.environment.startswith(PREFIX)
+        limits = [EPISODE_LENGTH if is_dmc else gym.spec(run.environment).max_episode_steps]
         for wrapper, arguments in env_wrappers(self.env_wrapper):
             limits += [arguments["max_episode_steps"] * self.action_repeat] if wrapper is gym.wrappers.TimeLimit else []
         self.episode_steps = min((limit for limit in limits if limit is not None), default=None)
@@ -117,10 +117,10 @@ class Setup:
         return env if self.normalize is None else VecNormalize(env, **{**self.normalize, **FIXED})
 
     def model(self, env: VecEnv) -> SACAux:
-        fitting = "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
+        policy = "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
         if isinstance(env.observation_space, spaces.Dict):
-            fitting = "MultiInputPolicy"
-        return SACAux(self.policy or fitting, env, **self.settings)
+            policy = "MultiInputPolicy"
+        return SACAux(self.policy or policy, env, **self.settings)
 
 
 def _with_schedules(value: Any) -> Any:
@@ -161,12 +161,12 @@ def check_run(run: Run, source: str | None = None) -> Setup:
     if setup.agent_steps <= learning_starts:
         message = "all %d agent steps are random actions, and nothing is learnt: learning_starts is %d"
         logger.warning(message, setup.agent_steps, learning_starts)
-    apart = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
+    interval = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
     if setup.episode_steps is None:
         logger.warning("%s has no time limit: an evaluation may take very long", run.environment)
-    elif apart < setup.episode_steps * setup.n_envs:
+    elif interval < setup.episode_steps * setup.n_envs:
         message = "evaluations every %d environment steps truncate episodes, which have up to %d steps"
-        logger.warning(message, apart // setup.n_envs, setup.episode_steps)
+        logger.warning(message, interval // setup.n_envs, setup.episode_steps)
     return setup
 
 
