@@ -306,6 +306,18 @@ def test_a_run_that_is_told_to_stop_is_not_submitted_again(tmp_path: Path) -> No
     assert not queue.jobs and not executor.pending and not (tmp_path / "1").exists()
 
 
+def test_an_executor_that_fails_is_tried_again(tmp_path: Path) -> None:
+    executor, n = Executor(), 0
+    queue = Queue(executor, retries=2)
+    job = queue.add(tmp_path, make_runs(AuxLoss.parse("{s_t} -> {r_t}"))[0])
+    while queue.jobs:
+        queue.update()
+        while executor.pending:
+            executor.pending.pop()[0].set_exception(ConnectionError("the node is gone"))
+            n += 1
+    assert (n, job.failure) == (3, "ConnectionError: the node is gone")
+
+
 def test_enqueued_losses_are_trained_and_invalid_ones_cost_nothing(tmp_path: Path) -> None:
     executor, rng = Executor(), random.Random(0)
     search = start(tmp_path, executor)

@@ -61,9 +61,7 @@ def make_matrix(
     losses = top_losses(study, section.top, section.top_rated) if top is None else top_losses(study, top)
     candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
     n_more = section.budget - len(section.seeds) if section.budget else 0
-    following = max(section.seeds) + 1
-    more = dict.fromkeys(range(following, following + n_more), candidates)
-    return _make_matrix(config, folder, {seed: [*candidates, *baselines] for seed in section.seeds} | more)
+    return _make_matrix(config, folder, [*candidates, *baselines], candidates, n_more)
 
 
 def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
@@ -95,15 +93,10 @@ def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
 def all_runs(config: SearchConfig) -> Mapping[Cell, Run]:
     """Baselines, and candidates that are not known yet, each with AARL-State: what a cross-validation would cost."""
     loss, section = catalog.load("aarl-state"), _section(config)
-    n_candidates = section.top + section.top_rated
-    if section.budget is None:
-        candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(n_candidates)]
-        return _make_matrix(config, Path(), {seed: [*candidates, *config.baselines] for seed in section.seeds}).runs
-    # As many runs, whichever candidates get them.
-    any_candidate, seeds = Baseline(name="candidates", aux_loss=loss), range(section.budget)
-    candidates_alone = _make_matrix(config, Path(), {seed: [any_candidate] for seed in seeds})
-    others = _make_matrix(config, Path(), dict.fromkeys(section.seeds, config.baselines))
-    return {**candidates_alone.runs, **others.runs}
+    candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(section.top + section.top_rated)]
+    n_more = section.budget - len(candidates) * len(section.seeds) if section.budget else 0
+    # Whichever candidates get those seeds.
+    return _make_matrix(config, Path(), [*candidates, *config.baselines], candidates[:1], n_more).runs
 
 
 def _section(config: SearchConfig) -> CrossValidation:
@@ -112,15 +105,19 @@ def _section(config: SearchConfig) -> CrossValidation:
     return config.cross_validation
 
 
-def _make_matrix(config: SearchConfig, folder: Path, variants: Mapping[int, Sequence[Baseline]]) -> Matrix:
-    """The matrix of variants by seed."""
+def _make_matrix(
+    config: SearchConfig, folder: Path, variants: Sequence[Baseline], racing: Sequence[Baseline], n_more: int
+) -> Matrix:
+    """All variants with the seeds of the section, and those that race with so many more seeds."""
     section = _section(config)
-    by_name = {variant.name: variant for of_seed in variants.values() for variant in of_seed}
+    more = range(max(section.seeds) + 1, max(section.seeds) + 1 + n_more)
+    by_name = {variant.name: variant for variant in variants}
+    of_seeds = dict.fromkeys(section.seeds, variants) | dict.fromkeys(more, racing)
     environments = section.environments or tuple(config.tasks)
     cells = [
         Cell(variant.name, environment, seed)
-        for seed, of_seed in variants.items()
-        for environment, variant in product(environments, of_seed)
+        for seed, some in of_seeds.items()
+        for environment, variant in product(environments, some)
     ]
     matrix = search_matrix(config, f"{config.name}-cross-validation", folder / "cross-validation", cells, by_name)
     # On the search's environments, runs may be longer than those of its candidates.
