@@ -29,14 +29,14 @@ from tiny import SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
 
 pytestmark = pytest.mark.slow
-# On two environments: a random loss and a prior, then two offspring.
+# On two environments: a random loss and a prior, then one of them once more and an offspring.
 TASKS = """\
 environments:
 - {environment: Pendulum-v1, returns: [-1600, 0]}
 - {environment: MountainCarContinuous-v0, returns: [-10, 100], checkpoints: [50, 100]}
 """
 SHORT = SEARCH.replace("environment: Pendulum-v1\n", TASKS).replace("[200, 400]", "[100, 200]")
-SHORT = SHORT.replace("n_random: 2", "n_random: 1").replace("population_size: 3", "population_size: 2")
+SHORT = SHORT.replace("n_random: 2", "n_random: 1").replace("population_size: 3", "population_size: 2\nagain: 0.5")
 Slots = dict[tuple[int, int], tuple[str, float | None]]
 
 

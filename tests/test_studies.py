@@ -14,7 +14,7 @@ from optuna.storages import InMemoryStorage
 from optuna.trial import create_trial
 from sb3_aarl.search.evolution.racing import standings
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
-from sb3_aarl.search.evolution.space import distributions, loss_of, loss_to_params, random_loss
+from sb3_aarl.search.evolution.space import SEED_INDEX_KEY, distributions, loss_of, loss_to_params, random_loss
 from sb3_aarl.search.evolution.surrogate import TokenModel
 from sb3_aarl.search.execution.driver import SearchProgress
 from sb3_aarl.search.execution.matrix import Cell, run_matrix, scores
@@ -152,9 +152,9 @@ def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None
         assert (run.environment, run.aux_loss) == ("Pendulum-v1", str(loss_of(trial)))
         assert (run.checkpoints, run.evaluation_episodes, run.threads, run.imports) == ((200, 400), 1, 2, ("json",))
         assert run.hyperparameters["policy_kwargs"]["net_arch"] == [8]
-    for index, seeds in ((1, [10, 11]), (2, [12, 13])):  # trained again
+    for index, seeds in ((1, [1004, 1009]), (2, [2004, 2009])):  # trained again
         trial = study.ask()
-        trial.set_user_attr("seed_index", index)
+        trial.set_user_attr(SEED_INDEX_KEY, index)
         assert [run.seed for run in make_runs(trial)] == seeds
 
 

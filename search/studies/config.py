@@ -138,7 +138,7 @@ class Baseline(BaseModel, frozen=True, extra="forbid"):
 
 class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     """
-    A search. Defaults are the paper's. What follows from ``population_size`` to ``screening`` is as in ``AuxLossSampler``.
+    A search. Defaults are the paper's. What follows from ``population_size`` to ``again`` is as in ``AuxLossSampler``.
 
     :param path: The file that it was read from
     :param imports: Modules that are imported first, such as those that register environments
@@ -153,7 +153,8 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     :param initial: A loss, by notation or name, or a list of losses. ``published`` and ``handcrafted`` are all losses of that
         kind in the search space, a path to a YAML file (relative to the file of the search) is its ``aux_loss``
     :param evolution_seed: Seed of the sampler
-    :param seeds: Seeds of the runs of every candidate, whose score is the mean over them
+    :param seeds: Seeds of the runs of every candidate, whose score is the mean over them. A loss that is trained again has
+        other ones: with each repetition a thousand more
     :param retries: How often a run that was killed is submitted again
     :param threads: PyTorch's threads of a run; they change the last bits of a result
     :param pruner: ``none``, ``median`` or ``hyperband``
@@ -185,6 +186,8 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     operators: tuple[str, ...] | None = None
     allow_duplicates: bool = False
     screening: PositiveInt = 1
+    parent_selection: Literal["best", "posterior"] = "best"
+    again: float = 0.0
     initial: tuple[AuxLoss, ...] = ()
     evolution_seed: NonNegativeInt = 0
     seeds: Seeds = (0,)

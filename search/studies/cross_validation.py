@@ -15,7 +15,7 @@ from sb3_aarl.search.evolution.surrogate import TokenModel
 from sb3_aarl.search.execution.matrix import Cell, Matrix, cell_folder, scores
 from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
-from sb3_aarl.search.studies.search import check_study, search_matrix
+from sb3_aarl.search.studies.search import check_study, search_matrix, stored_settings
 from sb3_aarl.search.training.config import ConfigError
 from sb3_aarl.search.training.folder import Run, is_finished
 
@@ -29,7 +29,8 @@ logger = logging.getLogger(__name__)
 def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLoss]:
     """
     The best candidates of a search by their scores, the best first, and after them ``top_rated`` others that the surrogate,
-    fitted to all scores, rates highest; in canonical form and each once.
+    fitted to all scores, rates highest; in canonical form and each once. Where losses are trained again, the surrogate
+    decides alone: the best score of several is luck.
     """
     scored = ranked(analysed(trial_table(study.get_trials(deepcopy=False))), study.direction)
     if scored.empty:
@@ -37,8 +38,12 @@ def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLos
     losses = list(dict.fromkeys(scored["canonical"]))
     surrogate = TokenModel(max(loss.horizon for loss in losses))
     surrogate.add(list(scored["canonical"]), list(scored["score"]))
-    rated = sorted(losses[top:], key=surrogate.rating, reverse=study.direction == StudyDirection.MAXIMIZE)
-    return losses[:top] + rated[:top_rated]
+
+    def by_rating(some: list[AuxLoss]) -> list[AuxLoss]:
+        return sorted(some, key=surrogate.rating, reverse=study.direction == StudyDirection.MAXIMIZE)
+
+    losses = by_rating(losses) if stored_settings(study).get("again") else losses
+    return losses[:top] + by_rating(losses[top:])[:top_rated]
 
 
 def make_matrix(

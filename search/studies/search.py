@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 SETTINGS_KEY = "settings"  # user attribute of a study
 # Settings of a search that may differ when it is resumed; those of its runs are in FREE.
 FREE_OF_SEARCH = ("n_generations", "pruner")
+# Of the repetitions of a loss: far from those of a cross-validation.
+SEEDS_APART = 1000
 ADVICE = "Another search needs a file of another name, another folder or another storage"
 
 
@@ -64,21 +66,15 @@ def runs_of(config: SearchConfig) -> Callable[[optuna.Trial], list[Run]]:
 
     def make_runs(trial: optuna.Trial) -> list[Run]:
         changes = {"aux_loss": str(suggest_aux_loss(trial))}
-        seeds = seeds_of(config.seeds, trial.user_attrs.get("seed_index", 0))
+        more = SEEDS_APART * AuxLossSampler.seed_index(trial)
         values = {name: _suggest(trial, name, distribution) for name, distribution in config.space.items()}
         runs = []
-        for template, seed in product(templates, seeds):
+        for template, seed in product(templates, config.seeds):
             hyperparameters = merge_space(template.hyperparameters, values)
-            runs.append(template.model_copy(update={**changes, "hyperparameters": hyperparameters, "seed": seed}))
+            runs.append(template.model_copy(update={**changes, "hyperparameters": hyperparameters, "seed": seed + more}))
         return runs
 
     return make_runs
-
-
-def seeds_of(seeds: Sequence[int], index: int) -> tuple[int, ...]:
-    """The seeds of the runs of a loss, 0 for its first ones, and others each time that it is trained again."""
-    following = max(seeds) + 1 + (index - 1) * len(seeds)
-    return tuple(range(following, following + len(seeds))) if index else tuple(seeds)
 
 
 def _suggest(trial: optuna.Trial, name: str, distribution: Any) -> Any:
