@@ -51,7 +51,7 @@ def write_report(
     table = analysis.trial_table(trials)
     best = analysis.ranked(table, study.direction)
     if stored_settings(study).get("again") and len(best):  # the mean of the runs of each loss
-        best["score"] = best.groupby("canonical")["score"].transform("mean")
+        best["score"] = best.groupby("canonical", sort=False)["score"].transform("mean")
         order = cross_validation.top_losses(study, len(best))
         best = best.drop_duplicates("canonical").sort_values("canonical", key=lambda losses: losses.map(order.index))
     title, baselines = study.study_name, list(baselines)
