@@ -174,7 +174,7 @@ class SimbaEncoder(Encoder):
     All of it is the trunk, which the actor reads through a projection of its own; the latent state is the trunk's output.
 
     :param observation_space: Any space that SB3 can flatten
-    :param features_dim: Width of the latent state and of all blocks; 128 learnt slower on Cheetah-Run (results/body)
+    :param features_dim: Width of the latent state and of all blocks; 128 was slower (results/agent/encoder_width)
     :param n_blocks: Number of residual blocks
     :param normalize: Whether observations are normalised; VecNormalize would do the same before
     :param observation: Whether the (normalised) observation stands beside the latent state, as a part of it

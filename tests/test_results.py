@@ -48,6 +48,7 @@ def shown(values: list[float]) -> str:
     return f"{statistics.mean(values):.0f} ± {statistics.stdev(values):.0f}"
 
 
+@pytest.mark.slow
 def test_every_table_is_that_of_the_runs() -> None:
     for path, text in make_tables["texts"]().items():
         assert path.read_text(encoding="utf-8") == text, f"{path}: run python results/make_tables.py"
