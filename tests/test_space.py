@@ -220,21 +220,6 @@ def test_unknown_operators_are_named(operators: tuple[str, ...] | str, culprit: 
         suggest_aux_loss(FixedTrial({"horizon": 1}), operators=operators)
 
 
-@pytest.mark.parametrize("settings", [{}, {"max_horizon": 1}, {"operators": ["mse", "cosine"]}], ids=str)
-def test_the_space_is_that_of_the_sampler(settings: dict[str, Any]) -> None:
-    sampler = AuxLossSampler(max_horizon=2, operators=["mse", "inner"], seed=0, n_random=20)
-    study = optuna.create_study(sampler=sampler)
-    losses = []
-    for _ in range(20):
-        trial = study.ask()
-        losses.append(suggest_aux_loss(trial, **settings))
-        study.tell(trial, 0.0)
-    assert {loss.operator for loss in losses} == {"mse", "inner"} and {loss.horizon for loss in losses} == {1, 2}
-    study.enqueue_trial({"horizon": 3})  # it would become a parent, of another space
-    with pytest.raises(optuna.TrialPruned, match="horizon was enqueued as 3"):
-        suggest_aux_loss(study.ask(), 3)
-
-
 def test_the_loss_of_a_trial() -> None:
     loss = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
     params: dict[str, Any] = loss_to_params(loss)

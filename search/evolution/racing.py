@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Draws from the posterior; the error of a probability of 5 % is 0.3 percentage points.
-N_DRAWS = 5_000
+# Draws from the posterior; the error of a probability of 5 % is 0.5 percentage points.
+N_DRAWS = 2_000
 # A loss whose probability to be the best is below this share of the leader's gets no new seed.
 LEAST_SHARE = 0.1
 # Variance of the true values in units of that of one run: what a study can meet.
