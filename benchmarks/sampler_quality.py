@@ -6,6 +6,10 @@ the five losses with the best noisy scores (different canonical forms) the best 
 would find it. It is normalised: 0 is the mean of random losses, 1 the optimum. The noise of an evaluation is as large as
 the standard deviation of random losses, or ``NOISE`` times as large. All objectives look at the canonical form only.
 
+With ``--emulated`` they search landscapes like that of a real search (``emulator.py``), and start from the losses that it
+was given: 150 runs, then a race of 60 runs between the ten losses that the surrogate rates highest, the same for all samplers.
+What counts is the true value of the loss that is chosen in the end, above that of the best given one.
+
 ``MORE`` are of the same kinds and were drawn after the sampler was finished, to see whether it is good at the first ones only.
 """
 
@@ -17,14 +21,18 @@ import time
 from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import optuna
+from emulator import NOISE as NOISE_OF_A_RUN
+from emulator import Emulator
 from saving import save_result
+from sb3_aarl.search.evolution.racing import next_runs, standings
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
-from sb3_aarl.search.evolution.space import MAX_HORIZON, random_loss, suggest_aux_loss
-from scipy.stats import mannwhitneyu
+from sb3_aarl.search.evolution.space import MAX_HORIZON, loss_to_params, random_loss, suggest_aux_loss
+from sb3_aarl.search.evolution.surrogate import TokenModel
+from scipy.stats import mannwhitneyu, ttest_rel
 
 from sb3_aarl.aux_loss import AuxLoss, Token
 
@@ -36,6 +44,18 @@ SAMPLERS: dict[str, Callable[[int], optuna.samplers.BaseSampler]] = {
     "paper": lambda seed: AuxLossSampler(seed=seed),
     "screened": lambda seed: AuxLossSampler(seed=seed, screening=32),
 }
+# With the losses that they start from. Those of Optuna get them enqueued.
+EMULATED: dict[str, Callable[[int, list[AuxLoss]], optuna.samplers.BaseSampler]] = {
+    "nsga2": lambda seed, given: optuna.samplers.NSGAIISampler(population_size=28, seed=seed),
+    "tpe": lambda seed, given: optuna.samplers.TPESampler(seed=seed),
+    "paper": lambda seed, given: AuxLossSampler(seed=seed, initial=given, **FIRST, population_size=28),
+    "screened": lambda seed, given: AuxLossSampler(seed=seed, initial=given, **FIRST, population_size=28, screening=32),
+    "ours": lambda seed, given: AuxLossSampler(seed=seed, initial=given, **FIRST, **OURS),
+    "ours, again": lambda seed, given: AuxLossSampler(seed=seed, initial=given, **FIRST, **OURS, again=0.2),
+}
+FIRST: dict[str, Any] = {"n_random": 20, "n_prior": 4}
+OURS: dict[str, Any] = {"population_size": 12, "screening": 32, "parent_selection": "posterior"}
+SEARCH_RUNS, RACE_RUNS, FINALISTS = 150, 60, 10
 
 
 class Objective(Protocol):
@@ -252,6 +272,60 @@ def run(cell: tuple[str, str, int, int]) -> dict[str, float | int | str]:
     return {**key, "best": best, "different": len(scores), "invalid": n_invalid, "seconds": round(seconds, 2)}
 
 
+def run_emulated(cell: tuple[str, int]) -> dict[str, float | int | str]:
+    """One search on one landscape, and the race between its best."""
+    name, seed = cell
+    started = time.process_time()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    emulator, noise = Emulator(seed), np.random.default_rng([seed, 1])
+    sampler = EMULATED[name](seed, emulator.given)
+    study = optuna.create_study(direction="maximize", sampler=sampler)
+    if not isinstance(sampler, AuxLossSampler):
+        for loss in emulator.given:
+            study.enqueue_trial(loss_to_params(loss))
+    runs: list[tuple[AuxLoss, float]] = []
+    while len(runs) < SEARCH_RUNS:
+        trial = study.ask()
+        try:
+            loss = suggest_aux_loss(trial).canonical()
+        except optuna.TrialPruned:
+            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+            continue
+        runs.append((loss, emulator(loss) + NOISE_OF_A_RUN * noise.standard_normal()))
+        study.tell(trial, runs[-1][1])
+    model = TokenModel(MAX_HORIZON)
+    model.add([loss for loss, _ in runs], [score for _, score in runs])
+    finalists = sorted({loss for loss, _ in runs}, key=lambda loss: (-model.rating(loss), str(loss)))[:FINALISTS]
+    scores = np.full((FINALISTS, RACE_RUNS), np.nan)
+    while missing := next_runs(scores, RACE_RUNS):
+        for row, column in missing:
+            scores[row, column] = emulator(finalists[row]) + NOISE_OF_A_RUN * noise.standard_normal()
+    values = [emulator(loss) - emulator.best_given for loss in finalists]
+    chosen = values[int(np.argmax(standings(scores).mean))]
+    seconds = time.process_time() - started
+    found = {"chosen": chosen, "best finalist": max(values), "different": len(model.scores), "seconds": round(seconds, 2)}
+    return {"sampler": name, "landscape": seed, **found}
+
+
+def report_emulated(cells: list[dict]) -> dict:
+    """Print the mean and its standard error, and the paired p of the last sampler but one against each."""
+    values = {name: {cell["landscape"]: cell["chosen"] for cell in cells if cell["sampler"] == name} for name in EMULATED}
+    table: dict = {}
+    print(f"{'':12} {'n':>3} {'above':>6} {'s.e.':>5} {'ours above it':>14} {'p':>8}")
+    for name, chosen in values.items():
+        if len(chosen) < 2:
+            continue
+        both = sorted(chosen.keys() & values["ours"].keys())
+        differences = [values["ours"][at] - chosen[at] for at in both]
+        row = {"n": len(chosen), "mean": float(np.mean(list(chosen.values())))}
+        row |= {"error": float(np.std(list(chosen.values()), ddof=1) / np.sqrt(len(chosen)))}
+        row |= {"difference": float(np.mean(differences)) if both else np.nan}
+        row |= {"p": float(ttest_rel([values["ours"][at] for at in both], [chosen[at] for at in both]).pvalue)}
+        table[name] = row
+        print(f"{name:12} {row['n']:3} {row['mean']:6.1f} {row['error']:5.1f} {row['difference']:14.1f} {row['p']:8.2g}")
+    return table
+
+
 def report(cells: list[dict]) -> dict:
     """Print means and deviations, and Mann-Whitney's two-sided p for every pair; also over all objectives at once."""
     tables: dict = {}
@@ -274,36 +348,44 @@ def report(cells: list[dict]) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--emulated", action="store_true", help="landscapes like that of a real search")
     parser.add_argument("--evaluations", type=int, default=500)
-    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--seeds", type=int, default=20, help="or landscapes")
     parser.add_argument("--objectives", nargs="+", default=list(OBJECTIVES), choices={**OBJECTIVES, **MORE})
-    parser.add_argument("--samplers", nargs="+", default=list(SAMPLERS), choices=SAMPLERS)
+    parser.add_argument("--samplers", nargs="+", choices={**SAMPLERS, **EMULATED})
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, help="JSON with all cells; what it has already is not run again")
     args = parser.parse_args()
 
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+    settings = {"emulated": args.emulated, "evaluations": SEARCH_RUNS + RACE_RUNS if args.emulated else args.evaluations}
+    names: tuple[str, ...] = ("sampler", "landscape") if args.emulated else ("objective", "sampler", "seed")
+    function: Callable[[Any], dict] = run_emulated if args.emulated else run
+    if args.emulated:
+        wanted: list[tuple] = [(name, seed) for seed in range(args.seeds) for name in args.samplers or EMULATED]
+    else:
+        samplers = args.samplers or SAMPLERS
+        wanted = [(o, s, seed) for seed in range(args.seeds) for s in samplers for o in args.objectives]
     done: list[dict] = []
     if args.out and args.out.exists():
         before = json.loads(args.out.read_text())
-        if before["evaluations"] != args.evaluations:
-            parser.error(f"{args.out} has {before['evaluations']} evaluations, not {args.evaluations}")
+        if differs := [key for key, value in settings.items() if before.get(key, False) != value]:
+            parser.error(f"{args.out} has other {', '.join(differs)}")
         done = before["cells"]
-    known = {(cell["objective"], cell["sampler"], cell["seed"]) for cell in done}
-    wanted = [(o, s, seed) for seed in range(args.seeds) for s in args.samplers for o in args.objectives]
-    todo = [(*key, args.evaluations) for key in wanted if key not in known]
-    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+    known = {tuple(cell[name] for name in names) for cell in done}
+    todo = [key if args.emulated else (*key, args.evaluations) for key in wanted if key not in known]
     # Spawned, not forked: the children of a process with threads hang now and then.
     with multiprocessing.get_context("spawn").Pool(args.processes) as pool:
-        for cell in pool.imap_unordered(run, todo):
+        for cell in pool.imap_unordered(function, todo):
             done.append(cell)
             print(f"{len(done)}/{len(known) + len(todo)}", cell, flush=True)
             if args.out:
                 args.out.parent.mkdir(parents=True, exist_ok=True)
-                args.out.write_text(json.dumps({"evaluations": args.evaluations, "cells": done}))
-    done.sort(key=lambda cell: (cell["objective"], cell["sampler"], cell["seed"]))
-    tables = report(done)
+                args.out.write_text(json.dumps({**settings, "cells": done}))
+    done.sort(key=lambda cell: [cell[name] for name in names])
+    tables = report_emulated(done) if args.emulated else report(done)
     if args.out:
-        save_result(args.out, evaluations=args.evaluations, tables=tables, cells=done)
+        save_result(args.out, **settings, tables=tables, cells=done)
 
 
 if __name__ == "__main__":
