@@ -1,7 +1,7 @@
 """
-Write all tables of results: table.md of each experiment, the index in README.md, and the tables of both README.md.
+Write all tables of results: table.md of each experiment, the index in README.md, the tables of both README.md and of docs/.
 
-Every number of a run comes from its curve.csv and provenance.json; tables.yml says which runs a table of a README.md shows.
+Every number of a run comes from its curve.csv and provenance.json; tables.yml says which runs a table of a page shows.
 """
 
 import math
@@ -9,6 +9,7 @@ import os
 import re
 import runpy
 import statistics
+import textwrap
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ from sb3_aarl.callbacks import read_curve
 RESULTS = Path(__file__).resolve().parent
 ROOT = RESULTS.parent
 SOURCE = "results/make_tables.py"
+# Pages that have some of the tables.
+PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in ("expect.md", "paper.md"))]
 # What a search does to losses; the others are drawn at random, from priors, or given.
 EVOLVED = ("crossover", "replacement", "horizon_change")
 DRAWN, BEST = 20, 10
@@ -38,10 +41,11 @@ DRAWN, BEST = 20, 10
 
 def texts() -> dict[Path, str]:
     """All files that this script writes, and their text."""
-    tables = {name: readme_table(rows) for name, rows in yaml.safe_load((RESULTS / "tables.yml").read_text("utf-8")).items()}
+    read = yaml.safe_load((RESULTS / "tables.yml").read_text("utf-8"))
+    tables = {name: sentence(part) if isinstance(part, str) else readme_table(part) for name, part in read.items()}
     abouts = sorted(RESULTS.glob("*/*/about.md"))
     tables["index"] = markdown([("experiment", "question", "answer"), *map(summary, abouts)])
-    files = {path: filled(path.read_text(encoding="utf-8"), tables) for path in (ROOT / "README.md", RESULTS / "README.md")}
+    files = {path: filled(path.read_text(encoding="utf-8"), tables) for path in PAGES}
     for folder in (about.parent for about in abouts):
         if (folder / STUDY_FILE).exists():
             files[folder / "table.md"] = page(folder, search_tables(folder))
@@ -64,6 +68,11 @@ def readme_table(rows: list[list[str]]) -> str:
     return markdown(
         [[returns(RESULTS / cell) if any((RESULTS / cell).glob("seed-*")) else cell for cell in row] for row in rows]
     )
+
+
+def sentence(text: str) -> str:
+    """A text of tables.yml; a folder in braces becomes the mean of its last returns."""
+    return textwrap.fill(re.sub(r"\{([\w-]+/[\w/-]+)\}", lambda found: returns(RESULTS / found[1]).split()[0], text), 126)
 
 
 def returns(folder: Path) -> str:
