@@ -177,7 +177,7 @@ class SimbaEncoder(Encoder):
     :param features_dim: Width of the latent state and of all blocks; 128 was slower (results/agent/encoder_width)
     :param n_blocks: Number of residual blocks
     :param normalize: Whether observations are normalised; VecNormalize would do the same before
-    :param observation: Whether the (normalised) observation stands beside the latent state, as a part of it
+    :param observation: Whether the latent state contains the (normalised) observation beside the output of the blocks
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class SimbaEncoder(Encoder):
         features_dim: int = 64,
         n_blocks: int = 1,
         normalize: bool = True,
-        observation: bool = False,
+        observation: bool = True,
     ):
         inputs = get_flattened_obs_dim(observation_space)
         super().__init__(observation_space, features_dim + inputs * observation, trunk_dim=features_dim + inputs * observation)

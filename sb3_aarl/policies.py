@@ -266,10 +266,10 @@ class SACAuxPolicy(SACPolicy):
         (-10, 2) (the public reference): tanh squashes it into them; gSDE ignores them
     :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases
         (CURL, the reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
-    :param critic_norm: None (SB3), ``"layer"``: layer norm in the Q networks, or ``"batch"``: batch norm there, one pass of
-        both states and no target Q networks (CrossQ, Bhatt et al., 2024)
+    :param critic_norm: ``"batch"`` (default): batch norm in the Q networks, one pass of both states and no target Q networks
+        (CrossQ, Bhatt et al., 2024); ``"layer"``: layer norm in them; None (SB3)
     :param kwargs: activation_fn, use_sde, log_std_init, use_expln, clip_mean, normalize_images, optimizer_class,
-        optimizer_kwargs and n_critics of SB3's SACPolicy
+        optimizer_kwargs and n_critics of SB3's SACPolicy; Adam's ``betas`` are (0.5, 0.999) unless given (CrossQ)
     """
 
     actor: Actor
@@ -291,10 +291,12 @@ class SACAuxPolicy(SACPolicy):
         crop_size: int | None = None,
         squash_log_std: tuple[float, float] | None = None,
         ortho_init: bool = False,
-        critic_norm: str | None = None,
+        critic_norm: str | None = "batch",
         **kwargs: Any,
     ):
         normalize_images = kwargs.get("normalize_images", True)
+        if kwargs.get("optimizer_class", th.optim.Adam) in (th.optim.Adam, th.optim.AdamW):
+            kwargs["optimizer_kwargs"] = {"betas": (0.5, 0.999), **(kwargs.get("optimizer_kwargs") or {})}
         self.augmentation = resolve_augmentation(augmentation, observation_space, crop_size, not normalize_images)
         self.image_keys = frozenset(image_spaces(observation_space, not normalize_images))
         self.crop_size = CROP_SIZE if crop_size is None else crop_size

@@ -51,6 +51,10 @@ class SACAux(SAC):
     The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The encoder
     of the target critic is the momentum encoder of the auxiliary loss. Arguments that are not here are SB3's.
 
+    Defaults that are not SAC's are CrossQ's (learning rate, updates of the actor, batch norm in the Q networks), SimBa's
+    (entropy) and MR.Q's (three-step returns). With all of SAC's and ``aux_loss=None`` it is SB3's SAC, to the bit:
+    ``zoo_configs/sac.yml`` has them.
+
     :param policy: ``"MlpPolicy"`` (``simba`` encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
     :param learning_rate: Of all optimizers that have none of their own, may be a schedule
@@ -64,8 +68,8 @@ class SACAux(SAC):
         was detected does not hold, a warning is raised and whole observations are stored
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns
-    :param ent_coef: As in SB3; ``"auto_0.1"`` (default, the paper) learns it from 0.1 on
-    :param target_entropy: As in SB3; ``"auto_0.5"`` is half of what ``"auto"`` is
+    :param ent_coef: As in SB3; ``"auto_0.01"`` (default) learns it from 0.01 on
+    :param target_entropy: As in SB3; ``"auto_0.5"`` (default) is half of what ``"auto"`` is
     :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
     :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``
     :param aux_loss: An AuxLoss, its notation, a name of the catalogue, a YAML file such as a search's ``winner.yml``, or
@@ -73,7 +77,7 @@ class SACAux(SAC):
         and forward dynamics otherwise; where neither can be trained it is None, with a warning
     :param aux_kwargs: How the loss is trained: ``learning_rate``, ``batch_size``, ``tau`` of the momentum encoder,
         ``predictor_width``, ``joint`` and ``coef``, see ``AuxOptions``
-    :param policy_delay: Gradient steps between updates of actor and entropy coefficient (2: CURL, the public reference)
+    :param policy_delay: Gradient steps between updates of actor and entropy coefficient
     :param ent_coef_optimizer_kwargs: Arguments of the entropy coefficient's Adam, such as ``lr`` (else ``learning_rate``)
         and ``betas``
     :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16; parameters, optimizers, Q
@@ -101,9 +105,9 @@ class SACAux(SAC):
         self,
         policy: str | type[SACAuxPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
+        learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 1_000_000,
-        learning_starts: int = 100,
+        learning_starts: int = 2500,
         batch_size: int = 256,
         tau: float = 0.005,
         gamma: float = 0.99,
@@ -113,10 +117,10 @@ class SACAux(SAC):
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: int = 1,
-        ent_coef: str | float = "auto_0.1",
+        n_steps: int = 3,
+        ent_coef: str | float = "auto_0.01",
         target_update_interval: int = 1,
-        target_entropy: str | float = "auto",
+        target_entropy: str | float = "auto_0.5",
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -128,7 +132,7 @@ class SACAux(SAC):
         device: th.device | str = "auto",
         aux_loss: AuxLoss | str | Path | Mapping[str, Any] | None = "auto",
         aux_kwargs: dict[str, Any] | None = None,
-        policy_delay: int = 2,
+        policy_delay: int = 3,
         ent_coef_optimizer_kwargs: dict[str, Any] | None = None,
         precision: str = "fp32",
         compile: bool = False,

@@ -166,7 +166,8 @@ def test_multi_input_encoder_is_its_parts_side_by_side(
     kinds = [PixelEncoder if x.ndim == 4 else vector_encoder for x in inputs]
     assert [type(part) for part in encoder.encoders] == kinds
     expected = [part(x) for part, x in zip(encoder.encoders, inputs, strict=True)]
-    assert [latent.shape[1] for latent in expected] == [5 if kind is PixelEncoder else 4 for kind in kinds]
+    widths = {PixelEncoder: 5, SimbaEncoder: 4 + inputs[-1].shape[1]}  # simba's latent state contains the observation
+    assert [latent.shape[1] for latent in expected] == [widths.get(kind, 4) for kind in kinds]
 
     latents = encoder(observations)
     th.testing.assert_close(latents, th.cat(expected, dim=1), rtol=1e-6, atol=1e-6)
@@ -178,7 +179,7 @@ def test_multi_input_encoder_is_its_parts_side_by_side(
 
 
 def test_simba_is_its_formula() -> None:
-    encoder = SimbaEncoder(vectors(3), features_dim=4)
+    encoder = SimbaEncoder(vectors(3), features_dim=4, observation=False)
     randomize(encoder)
     encoder.eval()
     x = th.randn(6, 3)
@@ -191,7 +192,7 @@ def test_simba_is_its_formula() -> None:
 
 
 def test_the_observation_beside_the_latent_state() -> None:
-    encoder = SimbaEncoder(spaces.Box(-1, 1, (3,)), 4, observation=True).eval()
+    encoder = SimbaEncoder(vectors(3), features_dim=4).eval()
     x = th.randn(5, 3)
     assert encoder.features_dim == 7 and th.equal(encoder(x)[:, 4:], encoder.normalization(x))
     assert th.equal(encoder(x)[:, :4], encoder.layers(encoder.normalization(x)))

@@ -83,13 +83,16 @@ def make_model(
     aux_kwargs: dict[str, Any] | None = None,
     **kwargs: Any,
 ) -> SACAux:
-    policy_kwargs = {"net_arch": [16], "crop_size": 16, **ENCODERS[kind], **(policy_kwargs or {})}
+    policy_kwargs = {"net_arch": [16], "crop_size": 16, "critic_norm": None, **ENCODERS[kind], **(policy_kwargs or {})}
     # Unlike the critic's, or Adam's first two steps would cancel out where critic and auxiliary loss disagree.
     aux_kwargs = {"learning_rate": 7e-4, "predictor_width": 12, **(aux_kwargs or {})}
     settings: dict[str, Any] = {
         "buffer_size": 300,
         "learning_starts": 20,
         "batch_size": 16,
+        "n_steps": 1,
+        "policy_delay": 2,
+        "target_entropy": "auto",
         "aux_loss": LOSS,
         "seed": 3,
         "device": "cpu",
@@ -135,7 +138,9 @@ def sac_and_ours(policy: str, env: Callable[[], Any], steps: int, ours: dict[str
     both: dict[str, Any] = {"buffer_size": 500, "learning_starts": 10, "batch_size": 16, "learning_rate": 1e-3, "tau": 0.02}
     both |= {"seed": 5, "device": "cpu", "ent_coef": "auto", **settings}
     sac = SAC(policy, env(), **both).learn(steps)
-    ours = {**both, **ours, "policy_kwargs": {**both["policy_kwargs"], **ours["policy_kwargs"]}}
+    sacs = {"critic_norm": None, "optimizer_kwargs": {"betas": (0.9, 0.999)}}
+    ours = {**both, **ours, "policy_kwargs": {**sacs, **both["policy_kwargs"], **ours["policy_kwargs"]}}
+    ours = {"n_steps": 1, "target_entropy": "auto", **ours}
     return sac, SACAux(policy, env(), **{"aux_loss": None, "policy_delay": 1, **ours}).learn(steps)
 
 
@@ -168,7 +173,11 @@ def test_with_encoders_of_their_own_is_sac(kind: str) -> None:
     """SB3's default: actor and critic each train an encoder, here of a class of the user's own."""
     extractor = {"state": FlattenExtractor, "pixels": SmallCNN, "dict": SmallCombined}[kind]
     # SB3's optimizer; the fused one of SACAux rounds in another way.
-    policy_kwargs = {"net_arch": [16], "features_extractor_class": extractor, "optimizer_kwargs": {"fused": False}}
+    policy_kwargs = {
+        "net_arch": [16],
+        "features_extractor_class": extractor,
+        "optimizer_kwargs": {"fused": False, "betas": (0.9, 0.999)},
+    }
     own = {"share_features_extractor": False, "augmentation": "none"}
     settings = {"aux_kwargs": {"tau": 0.02}, "policy_kwargs": own}
     sac, ours = sac_and_ours(POLICIES[kind], lambda: make_env(kind), 60, settings, policy_kwargs=policy_kwargs)
@@ -362,7 +371,7 @@ def test_train_agrees_with_naive_steps(
         gamma=0.9,
         tau=0.1,
         target_update_interval=2,
-        policy_kwargs={"squash_log_std": squash, "optimizer_kwargs": {"eps": 1e-3}},
+        policy_kwargs={"squash_log_std": squash, "optimizer_kwargs": {"betas": (0.9, 0.999), "eps": 1e-3}},
     )
     buffer = model.replay_buffer
     batches = [buffer.sample(16) for _ in range(6)]

@@ -128,8 +128,10 @@ def assert_equal_parameters(first: SACAux, second: SACAux) -> None:
 @pytest.mark.parametrize("method", ["__init__", "learn"])
 def test_defaults_are_those_of_sac(method: str) -> None:
     ours, sacs = (inspect.signature(getattr(cls, method)).parameters for cls in (SACAux, SAC))
-    changed = {"__init__": "ent_coef", "learn": "tb_log_name"}[method]
-    assert [name for name in sacs if ours[name].default != sacs[name].default] == [changed]
+    # Why: see the docstring of SACAux.
+    constructor = ["learning_rate", "learning_starts", "n_steps", "ent_coef", "target_entropy"]
+    changed = {"__init__": constructor, "learn": ["tb_log_name"]}[method]
+    assert [name for name in sacs if ours[name].default != sacs[name].default] == changed
 
 
 @pytest.mark.parametrize(
@@ -500,7 +502,7 @@ def test_float_images_of_a_dict() -> None:
     kwargs = {"normalize_images": False, "features_extractor_kwargs": {"cnn_output_dim": 5, "mlp_output_dim": 4}}
     model = make_model(RandomEnv(space), "MultiInputPolicy", kwargs)
     assert model.critic.features_extractor.image_keys == ["image"]
-    assert model.critic.features_extractor.features_dim == 9
+    assert model.critic.features_extractor.features_dim == 5 + 4 + VECTOR.shape[0]
     assert_all_train(model)
 
 
