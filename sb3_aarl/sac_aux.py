@@ -44,6 +44,11 @@ def _computes_bf16(device: th.device) -> bool:
     return device.type != "cpu" or th.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
 
 
+def default_learning_starts(total_timesteps: int) -> int:
+    """Agent steps with random actions in a run of ``total_timesteps``, unless ``learning_starts`` says how many."""
+    return min(5000, total_timesteps // 10)
+
+
 class SACAux(SAC):
     """
     Soft Actor-Critic whose encoder is also trained with an auxiliary loss (paper, section 3), around SB3's SAC.
@@ -59,7 +64,8 @@ class SACAux(SAC):
     :param env: The environment, or its registered name
     :param learning_rate: Of all optimizers that have none of their own, may be a schedule
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
-    :param learning_starts: Agent steps with random actions before learning starts
+    :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth of
+        the first ``learn`` if that is less: with fewer some runs of HalfCheetah never learn to run
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 0 freezes the whole target critic, as in SB3
     :param gamma: Discount factor
@@ -107,7 +113,7 @@ class SACAux(SAC):
         env: GymEnv | str,
         learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 1_000_000,
-        learning_starts: int = 2500,
+        learning_starts: int | None = None,
         batch_size: int = 256,
         tau: float = 0.005,
         gamma: float = 0.99,
@@ -143,7 +149,7 @@ class SACAux(SAC):
             env,
             learning_rate,
             buffer_size,
-            learning_starts,
+            learning_starts,  # type: ignore[arg-type]
             batch_size,
             tau,
             gamma,
@@ -519,6 +525,8 @@ class SACAux(SAC):
         if not reset_num_timesteps and self._stored_timesteps != self.num_timesteps:
             # A callback ended learn() before the last transition was stored: SB3 resets the environments.
             self._last_obs = None
+        if self.learning_starts is None:
+            self.learning_starts = default_learning_starts(total_timesteps)
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if not self._n_updates and self.gradient_steps != 0:
             self._warn_once("nothing was learnt: learning starts after %d agent steps", self.learning_starts)

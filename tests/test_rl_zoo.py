@@ -180,4 +180,4 @@ def test_no_arguments_of_the_environment(text: str, tmp_path: Path) -> None:
 
 def test_without_a_file_it_has_the_defaults() -> None:
     arguments = with_env_kwargs(SAC_AUX)
-    assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "sac_aux.yml" and added(arguments) == {"action_repeat": 4}
+    assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "sac_aux.yml" and added(arguments) == {"action_repeat": 2}

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from sb3_aarl import SACAux, catalog
 from sb3_aarl.buffers import WindowSamples
 from sb3_aarl.health import ExplodedError, NonFiniteError
+from sb3_aarl.sac_aux import default_learning_starts
 
 LOSS = "{s_t, a_t, r_t} -> {r_t+1, s_t+1, s_t+2}"
 KINDS = ("state", "pixels", "dict")
@@ -513,6 +514,13 @@ def test_a_horizon_longer_than_any_episode_is_skipped_and_counted(joint: bool, c
     assert 30 < model.logger.name_to_value["train/aux_skipped"] < 60
     assert math.isfinite(model.logger.name_to_value["train/aux_loss"])
     assert not th.equal(model.aux_head.state_dict()["predictor.0.weight"], before["predictor.0.weight"])
+
+
+def test_defaults_that_depend_on_run_and_actions() -> None:
+    model = SACAux("MlpPolicy", make_env("state"), batch_size=8, device="cpu").learn(60)
+    assert (model.learning_starts, model._n_updates) == (6, 54)  # a tenth of a short run
+    assert default_learning_starts(10**6) == 5000
+    assert model.target_entropy == -1.0  # half of SAC's, which is -2 for two actions
 
 
 def test_a_run_that_learns_nothing_says_so_once(caplog: pytest.LogCaptureFixture) -> None:

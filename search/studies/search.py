@@ -234,7 +234,7 @@ def settings(config: SearchConfig) -> dict[str, Any]:
         }
         values = {key: value for key, value in values.items() if key not in ("environment", "checkpoints")}
     else:
-        values |= runs[config.environment].hyperparameters
+        values |= next(iter(runs.values())).hyperparameters
     return json.loads(json.dumps(values))
 
 

@@ -32,6 +32,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from sb3_aarl import AuxLoss, SACAux
 from sb3_aarl.callbacks import SingleEpisodes
 from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
+from sb3_aarl.sac_aux import default_learning_starts
 
 logger = logging.getLogger(__name__)
 
@@ -120,7 +121,8 @@ class Setup:
         policy = "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
         if isinstance(env.observation_space, spaces.Dict):
             policy = "MultiInputPolicy"
-        return SACAux(self.policy or policy, env, **self.settings)
+        learning_starts = default_learning_starts(self.agent_steps)
+        return SACAux(self.policy or policy, env, **{"learning_starts": learning_starts, **self.settings})
 
 
 def _with_schedules(value: Any) -> Any:
@@ -171,12 +173,12 @@ def check_run(run: Run, source: str | None = None) -> Setup:
 
 
 def try_out(model: SACAux) -> None:
-    """Make some steps with the actions of a model, and two gradient steps."""
+    """Make some steps with the actions of a model, and the gradient steps up to the first of its actor."""
 
     def step(*_: Any) -> bool:
         if model.num_timesteps < TRIED_STEPS * model.n_envs:
             return True
-        model.train(2, model.batch_size)  # the actor is not trained at each
+        model.train(model.policy_delay, model.batch_size)  # the actor is not trained at each
         return False  # whatever the length of a rollout is
 
     model.verbose = model.learning_starts = 0
