@@ -22,6 +22,7 @@ from sb3_aarl.encoders import SimbaEncoder
 from sb3_aarl.envs import make_dmc_env
 
 SEED0 = 10_000
+RANDOM = 5000
 
 
 def make(task, seed):
@@ -150,6 +151,27 @@ V = {
         policy_delay=3,
         policy_kwargs=pk(features_extractor_class=ConcatSimba, optimizer_kwargs={"betas": (0.5, 0.999)}),
     ),
+    "bn3_cat_sep": dict(
+        **B,
+        cls=BNAux,
+        policy=BNPolicy,
+        n_steps=3,
+        learning_rate=1e-3,
+        policy_delay=3,
+        policy_kwargs=pk(
+            features_extractor_class=ConcatSimba, share_features_extractor=False, optimizer_kwargs={"betas": (0.5, 0.999)}
+        ),
+    ),
+    "bn3_cat_none": dict(
+        **B,
+        cls=BNAux,
+        policy=BNPolicy,
+        n_steps=3,
+        aux_loss=None,
+        learning_rate=1e-3,
+        policy_delay=3,
+        policy_kwargs=pk(features_extractor_class=ConcatSimba, optimizer_kwargs={"betas": (0.5, 0.999)}),
+    ),
     "bn_cat": dict(
         **B,
         cls=BNAux,
@@ -202,7 +224,7 @@ def build(variant, env, seed):
     cls = kw.pop("cls", SACAux)
     if kw.get("target_entropy") == "half":
         kw["target_entropy"] = -0.5 * env.action_space.shape[0]
-    kw.setdefault("learning_starts", 5000)
+    kw.setdefault("learning_starts", RANDOM)
     if kw.get("contrib"):
         import sb3_contrib
 
@@ -327,12 +349,15 @@ def main():
     p.add_argument("--out", default="out")
     p.add_argument("--episodes", type=int, default=5)
     p.add_argument("--seconds", type=float, default=1e9)
+    p.add_argument("--random", type=int, default=1000)
     a = p.parse_args()
     if a.seconds < 1e9:
         import threading
         import os
 
         threading.Timer(a.seconds, lambda: os._exit(0)).start()
+    global RANDOM
+    RANDOM = a.random
     env, repeat = make(a.task, a.seed)
     out = Path(a.out) / f"{a.variant}_{a.task.replace('/', '-')}_{a.seed}.jsonl"
     out.parent.mkdir(exist_ok=True, parents=True)
