@@ -252,7 +252,7 @@ def leaders(table: pd.DataFrame, top: int = 10) -> pd.DataFrame:
     for metric, name in names.items():
         best = ranking.nlargest(top, metric)
         for number, curve in zip(best["number"], best["curve"], strict=True):
-            rows += [(name, f"The best {top} candidates", number, *point) for point in curve]
+            rows += [(name, f"The best {top} candidates", number, *point[:2], math.nan) for point in curve]
     return pd.DataFrame(rows, columns=["variant", "env", "seed", "environment_steps", "mean", "std"])
 
 
