@@ -305,7 +305,9 @@ class _Slots:
             generation = int(min(self.candidates.generation, self.last))
             free = [(generation, len(self.sampler.operations(generation)) + number)]
             others = [other for other in self.unfinished if other != number]
-            logger.warning("Trial %d is one more of generation %d: trials %s hold its slots", number, generation, others)
+            logger.warning(
+                "Trial %d gets an extra slot of generation %d: running trials %s hold the others", number, generation, others
+            )
         (generation, slot), attempt = free[0], self.failed[free[0]]
         key: dict[str, Any] = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
         key |= {"max_horizon": self.sampler.max_horizon, "operators": self.sampler.operators}
