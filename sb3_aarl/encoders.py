@@ -189,7 +189,8 @@ class SimbaEncoder(Encoder):
         observation: bool = True,
     ):
         inputs = get_flattened_obs_dim(observation_space)
-        super().__init__(observation_space, features_dim + inputs * observation, trunk_dim=features_dim + inputs * observation)
+        latent_dim = features_dim + inputs * observation
+        super().__init__(observation_space, latent_dim, trunk_dim=latent_dim)
         self.observation = observation
         self.normalization: nn.Module = RunningNorm(inputs) if normalize else nn.Identity()
         blocks = [SimbaBlock(features_dim) for _ in range(n_blocks)]

@@ -6,7 +6,7 @@ import logging
 import math
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -42,6 +42,23 @@ def _computes_bf16(device: th.device) -> bool:
     if device.type == "cuda":
         return th.cuda.is_bf16_supported(including_emulation=False)
     return device.type != "cpu" or th.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
+
+
+def _soft_target(
+    next_q_values: Sequence[th.Tensor],
+    entropy_term: th.Tensor,
+    rewards: th.Tensor,
+    dones: th.Tensor,
+    discounts: th.Tensor | float,
+) -> th.Tensor:
+    """The target of the Q values: reward, and the smallest of the next Q values less ``entropy_term``; all (batch, 1)."""
+    next_q, _ = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True)  # type: ignore[arg-type]
+    return rewards + (1 - dones) * discounts * (next_q - entropy_term)
+
+
+def _q_loss(q_values: Sequence[th.Tensor], target_q: th.Tensor) -> th.Tensor:
+    """Half the sum of the critics' mean squared errors, as in SB3."""
+    return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
 
 
 def default_learning_starts(total_timesteps: int) -> int:
@@ -395,13 +412,11 @@ class SACAux(SAC):
         ent_coef: th.Tensor,
     ) -> th.Tensor:
         next_actions, next_log_prob = self._act(next_observations)
-        next_latent = self.critic_target.encode(next_observations)
-        next_q, _ = th.cat(self.critic_target.q_values(next_latent, next_actions), dim=1).min(dim=1, keepdim=True)
-        return rewards + (1 - dones) * discounts * (next_q - ent_coef * next_log_prob)
+        next_q_values = self.critic_target.q_values(self.critic_target.encode(next_observations), next_actions)
+        return _soft_target(next_q_values, ent_coef * next_log_prob, rewards, dones, discounts)
 
     def _critic_loss(self, trunk: Trunk, actions: th.Tensor, target_q: th.Tensor) -> th.Tensor:
-        q_values = self.critic.q_values(self.critic.encode(trunk), actions)
-        return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
+        return _q_loss(self.critic.q_values(self.critic.encode(trunk), actions), target_q)
 
     def _joint_critic_loss(
         self, trunk: Trunk, batch: ReplayBufferSamples, discounts: th.Tensor | float, ent_coef: th.Tensor
@@ -414,9 +429,8 @@ class SACAux(SAC):
         with self.critic.batch_statistics():
             both = self.critic.q_values(th.cat([latent, next_latent]), th.cat([batch.actions, next_actions]))
         q_values, next_q_values = zip(*(q.chunk(2) for q in both), strict=True)
-        next_q = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True)[0] - ent_coef * next_log_prob
-        target_q = (batch.rewards + (1 - batch.dones) * discounts * next_q).detach()
-        return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
+        target_q = _soft_target(next_q_values, ent_coef * next_log_prob, batch.rewards, batch.dones, discounts)
+        return _q_loss(q_values, target_q.detach())
 
     def _actor_loss(self, observations: PyTorchObs, actions: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
         with th.no_grad():
@@ -463,7 +477,8 @@ class SACAux(SAC):
     def _update_target(self) -> None:
         # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.
         if self.tau > 0:
-            polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
+            if self.critic.norm != "batch":  # which uses no target Q networks
+                polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
             polyak_update(self.critic.encoder_parameters, self.critic_target.encoder_parameters, self._aux.tau)
 
     @contextmanager
