@@ -308,7 +308,7 @@ def run_emulated(cell: tuple[str, int]) -> dict[str, float | int | str]:
 
 
 def report_emulated(cells: list[dict]) -> dict:
-    """Print the mean and its standard error, and the paired p of the last sampler but one against each."""
+    """Print mean and standard error of what each sampler chose, and the paired p of ours against each."""
     values = {name: {cell["landscape"]: cell["chosen"] for cell in cells if cell["sampler"] == name} for name in EMULATED}
     table: dict = {}
     print(f"{'':12} {'n':>3} {'above':>6} {'s.e.':>5} {'ours above it':>14} {'p':>8}")

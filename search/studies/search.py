@@ -218,6 +218,7 @@ def settings(config: SearchConfig) -> dict[str, Any]:
     """The settings that decide the scores of a search, as plain values. The sampler stores its own."""
     runs = {environment: make_run(config, environment, None, 0) for environment in config.tasks}
     exclude = {"aux_loss", "hyperparameters", "keep_model", "seed"}
+    exclude |= {"environment", "checkpoints"} if config.environments else set()
     values = next(iter(runs.values())).model_dump(exclude=exclude)
     values |= {
         "evolution_seed": config.evolution_seed,
@@ -232,7 +233,6 @@ def settings(config: SearchConfig) -> dict[str, Any]:
             environment: {"returns": config.returns_on(environment), "checkpoints": run.checkpoints, **run.hyperparameters}
             for environment, run in runs.items()
         }
-        values = {key: value for key, value in values.items() if key not in ("environment", "checkpoints")}
     else:
         values |= next(iter(runs.values())).hyperparameters
     return json.loads(json.dumps(values))

@@ -64,9 +64,6 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     by_variant = runs.groupby("variant", sort=False)
     table = by_variant[["done", "running", "failed"]].sum().astype(int)
     table.insert(0, "runs", by_variant.size())
-    table["score"] = (
-        by_variant["score"]
-        .mean()
-        .where((by_variant["task"].nunique() == 1) | (by_variant["scaled"].sum() == by_variant["score"].count()))
-    )
+    is_comparable = (by_variant["task"].nunique() == 1) | (by_variant["scaled"].sum() == by_variant["score"].count())
+    table["score"] = by_variant["score"].mean().where(is_comparable)
     return table.reset_index(), seconds_to_go(list(runs["seconds"].dropna()), runs["left"].sum(), int(runs["running"].sum()))
