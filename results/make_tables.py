@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import paper_tables
 import yaml
 from rich.table import Table
 from rich.text import Text
@@ -105,6 +106,10 @@ def benchmark_tables(folder: Path) -> Iterator[str]:
     for shown in table.terminal_tables(found):
         yield f"## {shown.title}\n\n{from_terminal(shown)}"
     yield "\n\n".join([*table.footnotes(found), *table.missing(found.runs), *table.mixed(found.runs)])
+    if (number := paper_tables.closest_table(found.runs["variant"])) is not None:
+        mark = "▲ ▼: the difference is more than two standard errors, 2 sqrt(s²/n + S²/N)."
+        beside = paper_tables.readable(paper_tables.beside(found.runs, number))
+        yield f"## Beside table {number} of the paper\n\n{from_frame(beside)}\n\n{mark}"
     heads = ("run", "return", "mean of the evaluations", "minutes", "threads", "processor", "commit", "date")
     yield "## Runs\n\n" + markdown([heads, *(run_row(path, folder, about) for path, about in read_abouts(folder).items())])
 

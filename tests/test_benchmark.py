@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import paper_tables
 import pytest
 from sb3_aarl.search.execution.executors import LocalExecutor
 from sb3_aarl.search.execution.matrix import Cell, cell_folder, check_matrix, run_matrix, scores
@@ -73,8 +74,8 @@ def test_without_options_the_zoo_makes_the_papers_tables(number: int, variants: 
     matrix = load_benchmark([ZOO / "paper" / f"{variant}.yml" for variant in variants])
     assert list(dict.fromkeys(cell.variant for cell in matrix.runs)) == variants
     assert {cell.seed for cell in matrix.runs} == {*range(10)} and len(matrix.runs) == n_tasks * 10 * len(variants)
-    scores = table.paper_scores(number)
-    assert set(variants) == set(scores["variant"].dropna()) and table.closest_table(variants) == number
+    scores = paper_tables.paper_scores(number)
+    assert set(variants) == set(scores["variant"].dropna()) and paper_tables.closest_table(variants) == number
     if number != 6:  # its environments are not named
         assert {cell.environment for cell in matrix.runs} == set(scores["environment"])
         for cell, about in matrix.abouts.items():

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from paper_tables import paper_scores
 from sb3_aarl.search.cli.main import app
 from sb3_aarl.search.execution.matrix import stored_scores
 from sb3_aarl.search.execution.storage import load_study, open_storage
 from sb3_aarl.search.results.analysis import analysed, trial_table
 from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.results.statistics import interquartile_means
-from sb3_aarl.search.results.table import paper_scores, read_runs
+from sb3_aarl.search.results.table import read_runs
 from sb3_aarl.search.studies import benchmark
 from sb3_aarl.search.studies.benchmark import load_benchmark, read_experiment
 from scipy.stats import mannwhitneyu
@@ -105,7 +106,7 @@ def test_figures_in_the_text_of_the_first_readme() -> None:
     figures += [shown(returns("paper/full_size/aarl_state_bf16"))]
     for number, columns in ((3, ("AARL-Pixel", "CURL")), (4, ("AARL-State",))):
         scores = paper_scores(number).query("checkpoint == 100_000 and environment == 'dm_control/cheetah-run-v0'")
-        figures += [f"{row.mean:.0f} ± {row.std:.0f}" for row in scores.itertuples() if row.column in columns]
+        figures += [f"{row.paper_mean:.0f} ± {row.paper_std:.0f}" for row in scores.itertuples() if row.column in columns]
     for name in ("AARL-Pixel", "CURL"):
         runs = RESULTS / "pixels/cheetah_run/runs" / f"{name.lower().replace('-', '_').replace('curl', 'curl_pixel')}_128_bf16"
         curve = {point.environment_steps: point.mean for point in read_curve(runs / "cheetah-run/seed-0/curve.csv")}
@@ -168,7 +169,7 @@ def test_decisions_at_sb3s_size(task: str) -> None:
 
 def test_the_distance_of_sac_from_the_paper() -> None:
     paper = paper_scores(4).query("checkpoint == 100_000").set_index(["environment", "column"])
-    mean, std, runs = paper.loc[("dm_control/cheetah-run-v0", "SAC-Identity"), ["mean", "std", "runs"]]
+    mean, std, runs = paper.loc[("dm_control/cheetah-run-v0", "SAC-Identity"), ["paper_mean", "paper_std", "paper_runs"]]
 
     def distance(choice: str) -> float:
         """In standard errors of the difference."""

@@ -1,7 +1,6 @@
-"""Tables of a benchmark: the paper's numbers, means, deviations, intervals and marks, and what is missing."""
+"""Tables of a benchmark: means, deviations, intervals, what is missing; and the paper's numbers beside them."""
 
 import io
-import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import paper_tables
 import pytest
 from rich.console import Console
 from sb3_aarl.search.execution.matrix import Cell, cell_folder
@@ -35,9 +35,10 @@ CHEETAH, WALKER, FISH = (f"dm_control/{task}-v0" for task in ("cheetah-run", "wa
 
 @pytest.mark.parametrize(("number", "checkpoint", "n_scores", "means", "deviations", "runs"), PAPER)
 def test_the_papers_scores(number: int, checkpoint: int, n_scores: int, means: float, deviations: float, runs: int) -> None:
-    scores = table.paper_scores(number).query("checkpoint == @checkpoint")
-    assert (len(scores), scores["mean"].sum(), scores["std"].sum()) == pytest.approx((n_scores, means, deviations))
-    assert set(scores["runs"]) == {runs} and set(scores["environment"]) <= {*env_ids(), "normalized"}
+    scores = paper_tables.paper_scores(number).query("checkpoint == @checkpoint")
+    sums = scores["paper_mean"].sum(), scores["paper_std"].sum()
+    assert (len(scores), *sums) == pytest.approx((n_scores, means, deviations))
+    assert set(scores["paper_runs"]) == {runs} and set(scores["environment"]) <= {*env_ids(), "normalized"}
     files = (Path(__file__).parent.parent / "zoo_configs/paper").glob("*.yml")
     assert set(scores["variant"].dropna()) <= {variant.name for file in files for variant in read_variants(file)}
 
@@ -54,9 +55,9 @@ def plant(folder: Path, cell: Cell, curve: Mapping[int, float], checkpoints: Seq
     return path
 
 
-def printed(folder: Path, number: int | None = None) -> str:
+def printed(folder: Path) -> str:
     """All that is shown of a benchmark, in one line with single spaces."""
-    found = table.read_tables(folder, number)
+    found = table.read_tables(folder)
     console = Console(width=1000, record=True, file=io.StringIO())
     for shown in table.terminal_tables(found):
         console.print(shown)
@@ -71,42 +72,26 @@ def plant_scores(folder: Path, scores: Mapping[tuple[str, str], np.ndarray]) -> 
             plant(folder, Cell(variant, environment, seed), {100_000: float(score)})
 
 
-def test_means_deviations_and_marks(tmp_path: Path) -> None:
+def test_what_is_two_standard_errors_from_the_paper_is_marked(tmp_path: Path) -> None:
     # Ten runs each, around the paper's mean plus so many standard errors, by Welch's statistic as scipy has it.
     spread = np.array([-9.0, -7.0, -4.0, -3.0, -1.0, 0.0, 2.0, 5.0, 7.0, 10.0]) * 6
-    paper = table.paper_scores(4).set_index(["checkpoint", "environment", "variant"]).loc[100_000]
-    gaps = dict(
-        zip(
-            itertools.product([CHEETAH, WALKER, FISH], ["aarl_state", "sac_identity"]),
-            [-2.01, -1.99, 0, 1.99, 2.01, 9],
-            strict=True,
-        )
-    )
+    paper = paper_tables.paper_scores(4).set_index(["checkpoint", "environment", "variant"]).loc[100_000]
+    cells = {("aarl_state", CHEETAH): -2.01, ("sac_identity", CHEETAH): -1.99, ("sac_identity", WALKER): 2.01}
     scores = {}
-    for (environment, variant), gap in gaps.items():
-        mean, std, _ = paper.loc[(environment, variant), ["mean", "std", "runs"]]
-        error = math.sqrt(spread.var(ddof=1) / 10 + std**2 / 10)
-        scores[variant, environment] = mean + gap * error + spread
+    for (variant, environment), gap in cells.items():
+        mean, std = paper.loc[(environment, variant), ["paper_mean", "paper_std"]]
+        scores[f"{variant}_bf16", environment] = mean + gap * math.sqrt(spread.var(ddof=1) / 10 + std**2 / 10) + spread
     plant_scores(tmp_path, {**scores, ("mine", CHEETAH): spread})
-    result = table.compare(table.in_order(table.read_runs(tmp_path), 4), 4).set_index(["environment", "variant"])
-    for (variant, environment), of_seeds in scores.items():
-        row = result.loc[(environment, variant)]
-        mean, std, _ = paper.loc[(environment, variant), ["mean", "std", "runs"]]
-        welch = stats.ttest_ind_from_stats(of_seeds.mean(), of_seeds.std(ddof=1), 10, mean, std, 10, equal_var=False)
-        assert (row["planned"], row["runs"], row["paper_mean"], row["paper_std"]) == (10, 10, mean, std)
-        assert row["mean"] == pytest.approx(of_seeds.mean()) and row["std"] == pytest.approx(of_seeds.std(ddof=1))
+    runs = table.read_runs(tmp_path)
+    assert paper_tables.closest_table(runs["variant"]) == 4 and paper_tables.closest_table(["mine"]) is None
+    result = paper_tables.beside(runs, 4).set_index(["variant", "environment"])
+    assert set(result.index) == set(scores)
+    for key, of_seeds in scores.items():
+        row = result.loc[key]
+        of_paper = row["paper_mean"], row["paper_std"], row["paper_runs"]
+        welch = stats.ttest_ind_from_stats(of_seeds.mean(), of_seeds.std(ddof=1), 10, *of_paper, equal_var=False)
         assert row["difference"] / row["standard_error"] == pytest.approx(welch.statistic)
-        assert row["mark"] == ("higher" if welch.statistic > 2 else "lower" if welch.statistic < -2 else "")
-    assert list(result["mark"]).count("") == 4  # 1.99, 0, 1.99, and the variant that the paper does not have
-    row = result.loc[(CHEETAH, "mine")]
-    assert row["mean"] == pytest.approx(0) and math.isnan(row["paper_mean"]) and row["column"] == "mine"
-    # Tasks and variants in the paper's order, others behind.
-    assert list(dict.fromkeys(result.reset_index()["environment"])) == [CHEETAH, WALKER, FISH]
-    assert [variant for environment, variant in result.index if environment == CHEETAH] == [
-        "aarl_state",
-        "sac_identity",
-        "mine",
-    ]
+        assert row["mark"] == ("▲" if welch.statistic > 2 else "▼" if welch.statistic < -2 else "")
 
 
 TASKS = [
@@ -265,10 +250,9 @@ def test_on_one_task_pairs_have_the_p_of_mann_and_whitney(tmp_path: Path) -> Non
 def test_one_run_has_neither_deviation_nor_interval_nor_mark(tmp_path: Path) -> None:
     plant_scores(tmp_path, {("aarl_state", CHEETAH): np.array([1.0]), ("sac_identity", CHEETAH): np.array([999.0])})
     runs = table.read_runs(tmp_path)
-    result = table.compare(runs, 4)
-    assert result["std"].isna().all() and list(result["mark"]) == ["", ""] and list(result["mean"]) == [1.0, 999.0]
+    assert list(paper_tables.beside(runs, 4)["mark"]) == ["", ""]
     assert table.interquartile_means(runs)[["low", "high"]].isna().all(axis=None)
-    assert "│ cheetah-run │ 1 │ 472 ± 30 │" in printed(tmp_path)
+    assert "│ cheetah-run │ 1 │ 999 │" in printed(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -285,12 +269,12 @@ def test_one_run_has_neither_deviation_nor_interval_nor_mark(tmp_path: Path) -> 
 )
 def test_normalized_returns(returns: dict[str, list[float]], expected: dict[str, tuple[float, float]]) -> None:
     rows = [(variant, task, last) for variant, values in returns.items() for task, last in zip("xy", values, strict=True)]
-    result = table.normalized(pd.DataFrame(rows, columns=["variant", "environment", "mean"]))
+    result = paper_tables.normalized(pd.DataFrame(rows, columns=["variant", "environment", "mean"]))
     for variant, numbers in expected.items():
         assert tuple(result.loc[variant]) == pytest.approx(numbers)
 
 
-def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
+def test_table_6_is_normalized_by_the_papers_variants(tmp_path: Path) -> None:
     returns = {
         "aarl_state": {CHEETAH: [400.0, 480.0], WALKER: [900.0, 910.0]},
         "aarl_mlp_1": {CHEETAH: [390.0, 410.0], WALKER: [700.0, 850.0]},
@@ -298,41 +282,16 @@ def test_table_6_is_normalized_over_environments(tmp_path: Path) -> None:
         "aarl_mlp_4": {CHEETAH: [100.0, 150.0], WALKER: [300.0]},  # a run is missing
     }
     plant_scores(tmp_path, {(v, e): np.array(scores) for v, of in returns.items() for e, scores in of.items()})
-    failed = plant(tmp_path, Cell("aarl_mlp_4", WALKER, 1), {})
-    (failed / "failed.json").write_text('{"reason": "it burst", "retry": true}')
-    result = table.compare(table.read_runs(tmp_path), 6).set_index("variant")
-    assert result.loc["aarl_state", "mean"] == 1.0 and set(result["environment"]) == {"normalized"}
-    assert math.isnan(result.loc["aarl_mlp_4", "mean"]) and tuple(result.loc["aarl_mlp_4", ["planned", "runs"]]) == (4, 3)
-    # Normalized by others than the paper's four: no number of the paper, no mark, and why.
-    assert result[["paper_mean", "paper_std", "paper_runs", "difference"]].isna().all(axis=None) and set(result["mark"]) == {
-        ""
-    }
-    shown = printed(tmp_path)
-    assert "100K steps scores, without the paper's: normalized by other variants than its own" in shown
-    assert "1.000 ± 0.12" not in shown and "aarl_mlp_4 on walker-walk, seed 1: it burst" in shown
-
-    write_curve(failed / "curve.csv", [Evaluation(100_000, 310.0, 1.0, 10, 2.0)])
-    result = table.compare(table.read_runs(tmp_path), 6).set_index("variant")
-    assert list(result["paper_runs"]) == [30] * 4 and result.loc["aarl_state", "paper_mean"] == 1.0 == result["mean"].max()
-    shown = printed(tmp_path)
-    assert "1.000 ± 0.129" in shown and "without the paper's" not in shown
+    missing = plant(tmp_path, Cell("aarl_mlp_4", WALKER, 1), {})
+    assert paper_tables.beside(table.read_runs(tmp_path), 6).empty
+    write_curve(missing / "curve.csv", [Evaluation(100_000, 310.0, 1.0, 10, 2.0)])
+    result = paper_tables.beside(table.read_runs(tmp_path), 6).set_index("variant")
+    assert list(result["paper_runs"]) == [30] * 4 and result.loc["aarl_state", "mean"] == 1.0 == result["mean"].max()
     plant(tmp_path, Cell("mine", CHEETAH, 0), {100_000: 900.0}, sessions=[])
-    assert table.compare(table.read_runs(tmp_path), 6)["paper_mean"].count() == 4  # not complete: it normalizes nothing
+    assert len(paper_tables.beside(table.read_runs(tmp_path), 6)) == 4  # not complete: it normalizes nothing
     for cell in (Cell("mine", CHEETAH, 1), Cell("mine", WALKER, 0), Cell("mine", WALKER, 1)):
         plant(tmp_path, cell, {100_000: 900.0})
-    assert table.compare(table.read_runs(tmp_path), 6)["paper_mean"].count() == 0
-
-
-def test_variants_in_bfloat16_stand_beside_the_papers(tmp_path: Path) -> None:
-    variants = ["aarl_state_bf16_joint", "sac_dense_mlp_bf16", "aarl_state_bf16", "aarl_state"]
-    plant_scores(tmp_path, {(name, CHEETAH): np.array([200.0, 210.0, 220.0]) for name in variants})
-    runs = table.read_runs(tmp_path)
-    assert table.closest_table(["aarl_state_bf16"]) == 4 and table.closest_table(["aarl_state_bf16_joint"]) is None
-    result = table.compare(table.in_order(runs, 4), 4).set_index("variant")
-    assert list(result.index) == ["aarl_state", "aarl_state_bf16", "sac_dense_mlp_bf16", "aarl_state_bf16_joint"]
-    assert result["column"].tolist() == ["AARL-State", "AARL-State", "SAC", "aarl_state_bf16_joint"]
-    assert result["paper_mean"].iloc[:3].tolist() == [472.0, 472.0, 172.0] and math.isnan(result["paper_mean"].iloc[3])
-    assert result["mark"].tolist() == ["lower", "lower", "higher", ""]
+    assert paper_tables.beside(table.read_runs(tmp_path), 6).empty
 
 
 def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
@@ -347,7 +306,7 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
         plant(tmp_path, Cell("aarl_state", CHEETAH, seed), {}, steps, sessions=[])
     plant(tmp_path, Cell("mine", CHEETAH, 0), {}, steps, sessions=[{"commit": "c0ffee"}, {"commit": "beef"}])
     found = table.read_tables(tmp_path)
-    _, runs, comparison, iqm, _ = found
+    runs, comparison, iqm, _ = found
     row = comparison.set_index(["checkpoint", "variant"]).loc[(100_000, "aarl_state")]
     assert (row["planned"], row["runs"], row["mean"]) == (7, 4, np.mean([470, 471, 472, 480]))
     lines = table.missing(runs)
@@ -369,22 +328,11 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
     assert "Runs with different commits: c0ffee (8); c0ffee, beef (1)" in shown
 
 
-def test_the_layout_and_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) -> None:
-    ours = {("aarl_state", CHEETAH): np.array([430.0, 440.0]), ("curl_state", CHEETAH): np.array([189.0, 191.0])}
-    plant_scores(tmp_path, ours)
+def test_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) -> None:
     found = table.read_tables(tmp_path)
-    _, runs, comparison, iqm, better = found
-    own = [
-        f"{scores.mean():.0f} ± {scores.std(ddof=1):.0f}"
-        for scores in (matrix[:, 2] for matrix in planted_matrices().values())
-    ]
-    shown = printed(tmp_path)
-    assert f"│ cheetah-run │ 435 ± 7 ▼ │ 472 ± 30 │ 190 ± 1 │ 190 ± 32 │ {own[0]} │ {own[1]} │" in shown
-    assert shown.index("AARL-State") < shown.index("CURL") and "Paper: table 4." in shown
     data = json.loads(json.dumps(table.as_data(found)))
-    assert data["table"] == 4 and data["missing"] == []
-    frames = {"scores": comparison, "improvements": better, "interquartile_means": iqm, "runs": runs}
-    for name, frame in frames.items():
+    assert data.pop("missing") == []
+    for name, frame in zip(("runs", "scores", "interquartile_means", "improvements"), found, strict=True):
         same = pd.DataFrame(data[name], columns=list(frame.columns)).astype(frame.dtypes.to_dict())
         pd.testing.assert_frame_equal(same, frame, check_exact=False)
 

@@ -36,7 +36,7 @@ def table(
     folder: options.Benchmark = options.BENCHMARK,
     json: options.Json = False,
 ) -> None:
-    """Show a benchmark beside the paper's tables, with interquartile means and probabilities of improvement."""
+    """Show a benchmark: means and deviations, interquartile means and probabilities of improvement."""
     from sb3_aarl.search.results import table as tables
 
     found = tables.read_tables(folder)

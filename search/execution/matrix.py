@@ -160,12 +160,3 @@ def _scores(runs: Iterable[tuple[Cell, Path]]) -> pd.DataFrame:
         elif outcome is not None:
             rows.append((*cell, math.nan, math.nan))
     return pd.DataFrame(rows, columns=[*Cell._fields, "score", "last"])
-
-
-def comparable(runs: pd.DataFrame) -> pd.DataFrame:
-    """
-    The runs of the variants that have each environment and seed which any variant has. The others cannot be ranked: what
-    they lack may be what is hard.
-    """
-    n_pairs = len(runs[["environment", "seed"]].drop_duplicates())
-    return runs[runs.groupby("variant")["variant"].transform("size") == n_pairs]

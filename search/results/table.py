@@ -1,61 +1,23 @@
-"""A benchmark's runs in the layout of tables 2, 3, 4 and 6 of the paper, beside its numbers, with rliable's statistics."""
+"""A benchmark's runs as tables: means and deviations on each task, and rliable's statistics over tasks."""
 
 import json
 import math
-from collections.abc import Iterable
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
-import yaml
 from rich.markup import escape
 from rich.table import Table
-from sb3_aarl.search.execution.matrix import comparable, task_name
+from sb3_aarl.search.execution.matrix import task_name
 from sb3_aarl.search.results.statistics import SUITE, improvements, interquartile_means
 from sb3_aarl.search.studies.benchmark import read_abouts
 from sb3_aarl.search.training.folder import FAILED, partial_curve
 
 from sb3_aarl.envs import PREFIX
 
-# A difference is marked from so many standard errors on.
-STANDARD_ERRORS = 2.0
-MARKS = {"higher": "▲", "lower": "▼", "": ""}
-# The row of tables 2 and 6, which have no environments.
-NORMALIZED = "normalized"
 # With more variants than that they go down the rows, and of their pairs those with the best one are shown.
 MANY = 6
-# Suffix of a variant whose networks compute in bfloat16: the paper's all the same.
-BF16 = "_bf16"
 RUN_COLUMNS = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions", "program", "episodes"]
-PAPER_COLUMNS = ["checkpoint", "environment", "column", "variant", "mean", "std", "runs"]
-
-
-@cache
-def _paper() -> dict[int, dict[str, Any]]:
-    return yaml.safe_load(Path(__file__).with_name("paper_tables.yml").read_text(encoding="utf-8"))
-
-
-def paper_scores(number: int | None) -> pd.DataFrame:
-    """A table of the paper, empty for None; ``variant`` is a name in ``zoo_configs``, None for methods that are not here."""
-    rows = []
-    for table in [] if number is None else [_paper()[number]]:
-        for checkpoint, tasks in table["scores"].items():
-            for task, scores in tasks.items():
-                environment = task if task == NORMALIZED else f"{PREFIX}{task}-v0"
-                for (column, variant), score in zip(table["columns"].items(), scores, strict=True):
-                    if score is not None:
-                        rows.append((checkpoint, environment, column, variant, *map(float, score), table["runs"]))
-    return pd.DataFrame(rows, columns=PAPER_COLUMNS)
-
-
-def closest_table(variants: Iterable[str]) -> int | None:
-    """The paper's table with the most of some variants, None if none has any."""
-    names = {variant.removesuffix(BF16) for variant in variants}
-    matches = {number: len(names & set(table["columns"].values())) for number, table in _paper().items()}
-    best = max(matches, key=lambda number: matches[number])
-    return best if matches[best] else None
 
 
 def read_runs(folder: Path) -> pd.DataFrame:
@@ -88,87 +50,10 @@ def _why_missing(path: Path, about: dict[str, Any], checkpoint: int, returns: di
     return f"unfinished, evaluated up to {max(returns, default=0):,}" if about["sessions"] else "not started"
 
 
-def in_order(runs: pd.DataFrame, number: int | None) -> pd.DataFrame:
-    """The runs in the order of a table of the paper, its tasks and variants before others; None for alphabetical order."""
-    positions = {}
-    for key in ("environment", "variant"):
-        paper = [name + suffix for name in paper_scores(number)[key].dropna() for suffix in ("", BF16)]
-        positions[key] = {name: position for position, name in enumerate(dict.fromkeys([*paper, *sorted(runs[key])]))}
-    keys = ["checkpoint", "environment", "variant", "seed"]
-    return runs.sort_values(
-        keys, key=lambda column: column.map(positions[column.name]) if column.name in positions else column, ignore_index=True
-    )
-
-
-def compare(runs: pd.DataFrame, number: int | None = None) -> pd.DataFrame:
-    """
-    Means and deviations over seeds, beside the paper's.
-
-    ``std`` is the sample deviation (n - 1). A difference is marked when it exceeds two standard errors of a difference of two
-    means, 2 sqrt(s^2 / n + S^2 / N), with s and n of the runs here, S and N of the paper's table; the paper does not say
-    which deviation it prints. With one run here there is no s, and no mark.
-
-    For tables 2 and 6 the returns are normalized, see :func:`normalized`, over the variants that are complete: if these are
-    not the paper's, its numbers are left out. N is 5 seeds x 3 or 6 environments there, so both deviations contain the
-    difference of the environments: the test is a cautious one.
-    """
-    keys = ["checkpoint", "environment", "variant"]
-    numbers = ["paper_mean", "paper_std", "paper_runs"]
-    if number in (2, 6):
-        result = _normalized(runs)
-    else:
-        by_task = runs.groupby(keys, sort=False)["mean"]
-        result = by_task.agg(planned="size", runs="count", mean="mean", std="std").reset_index()
-    paper = paper_scores(number)
-    headings = dict(zip(paper["variant"], paper["column"], strict=True))
-    paper = paper.rename(columns={"variant": "paper_variant", "mean": numbers[0], "std": numbers[1], "runs": numbers[2]})
-    paper = paper.drop(columns="column").astype(dict.fromkeys(numbers, float))
-    result["paper_variant"] = result["variant"].str.removesuffix(BF16)
-    names = zip(result["paper_variant"], result["variant"], strict=True)
-    result["column"] = [headings.get(name, variant) for name, variant in names]
-    result = result.merge(paper, on=[*keys[:2], "paper_variant"], how="left")
-    for _, part in result.groupby("checkpoint"):
-        if not _is_comparable(part, number):
-            result.loc[part.index, numbers] = math.nan
-    result["difference"] = result["mean"] - result["paper_mean"]
-    variance = result["std"] ** 2 / result["runs"] + result["paper_std"] ** 2 / result["paper_runs"]
-    result["standard_error"] = np.sqrt(variance)
-    far = result["difference"].abs() > STANDARD_ERRORS * result["standard_error"]
-    result["mark"] = np.where(far, np.where(result["difference"] > 0, "higher", "lower"), "")
-    return result[[*keys, "planned", "runs", "mean", "std", "column", *numbers, "difference", "standard_error", "mark"]]
-
-
-def _is_comparable(comparison: pd.DataFrame, number: int | None) -> bool:
-    """Whether the scores of a checkpoint can be compared with the paper's: not if they are normalized by other variants."""
-    is_normalized = (comparison["environment"] == NORMALIZED).any()
-    variants = sorted(comparison.dropna(subset="mean")["variant"].str.removesuffix(BF16))
-    return not is_normalized or variants == sorted(_paper()[number or 6]["columns"].values())
-
-
-def _normalized(runs: pd.DataFrame) -> pd.DataFrame:
-    """Each variant's mean over all environments; only variants that have all runs can be normalized together."""
-    parts = []
-    for checkpoint, part in runs.groupby("checkpoint"):
-        n_runs = part.groupby("variant", sort=False)["mean"].count()
-        n_planned = len(part[["environment", "seed"]].drop_duplicates())
-        table = normalized(comparable(part.dropna(subset="mean"))).reindex(n_runs.index)
-        table = table.assign(runs=n_runs, planned=n_planned, checkpoint=checkpoint, environment=NORMALIZED)
-        parts.append(table.reset_index())
-    return pd.concat(parts, ignore_index=True)
-
-
-def normalized(runs: pd.DataFrame) -> pd.DataFrame:
-    """
-    Mean and sample deviation of normalized returns over all environments and seeds, for each variant.
-
-    The paper does not say how returns are normalized. Here each is divided by the size of the mean of all variants on
-    its environment, so that environments count alike and higher is better even if returns are negative, and then all by
-    the best variant's mean, so that this is 1; unless it is negative.
-    """
-    scale = runs.groupby("environment")["mean"].transform("mean").abs()
-    result = (runs["mean"] / scale.where(scale != 0, 1.0)).groupby(runs["variant"]).agg(["mean", "std"])
-    best = result["mean"].max()
-    return result / best if best > 0 else result
+def compare(runs: pd.DataFrame) -> pd.DataFrame:
+    """Mean and sample deviation over seeds of each variant on each environment, with its planned and finished runs."""
+    returns = runs.groupby(["checkpoint", "environment", "variant"], sort=False)["mean"]
+    return returns.agg(planned="size", runs="count", mean="mean", std="std").reset_index()
 
 
 def missing(runs: pd.DataFrame) -> list[str]:
@@ -197,56 +82,40 @@ def mixed(runs: pd.DataFrame) -> list[str]:
 
 
 class Tables(NamedTuple):
-    """All that is shown of a benchmark: as returned by the functions above, and the number of the paper's table."""
+    """All that is shown of a benchmark, as returned by the functions above."""
 
-    number: int | None
     runs: pd.DataFrame
     comparison: pd.DataFrame
     iqm: pd.DataFrame
     better: pd.DataFrame
 
 
-def read_tables(folder: Path, number: int | None = None) -> Tables:
-    """All that is shown of a benchmark, beside a table of the paper: by default the one with most of the variants."""
-    runs = read_runs(folder)
-    number = closest_table(runs["variant"]) if number is None else number
-    runs = in_order(runs, number)
-    return Tables(number, runs, compare(runs, number), interquartile_means(runs), improvements(runs))
+def read_tables(folder: Path) -> Tables:
+    """All that is shown of a benchmark, in alphabetical order."""
+    runs = read_runs(folder).sort_values(["checkpoint", "environment", "variant", "seed"], ignore_index=True)
+    return Tables(runs, compare(runs), interquartile_means(runs), improvements(runs))
 
 
 def terminal_tables(tables: Tables) -> list[Table]:
-    """The scores in the layout of the paper, then the statistics over tasks, for each checkpoint."""
-    return [*_score_tables(tables.comparison, tables.number), *_statistics_tables(tables.iqm, tables.better)]
+    """The scores, then the statistics over tasks, for each checkpoint."""
+    return [*_score_tables(tables.comparison), *_statistics_tables(tables.iqm, tables.better)]
 
 
-def _score_tables(comparison: pd.DataFrame, number: int | None) -> list[Table]:
-    """For each checkpoint tasks and variants, the fewer as columns, the paper's score beside each."""
+def _score_tables(comparison: pd.DataFrame) -> list[Table]:
+    """For each checkpoint tasks and variants, the fewer as columns."""
     tables = []
     for checkpoint, part in comparison.groupby("checkpoint"):
-        problem = "" if _is_comparable(part, number) else ", without the paper's: normalized by other variants than its own"
-        table = Table("", title=f"{_steps(checkpoint)} steps scores{problem}")
-        variant_names = [
-            (variant, variant if heading == variant else f"{heading}\n{variant}")
-            for variant, heading in dict(zip(part["variant"], part["column"], strict=True)).items()
-        ]
-        task_names = [(environment, task_name(str(environment))) for environment in part["environment"].unique()]
-        key, rows, other, columns = "environment", task_names, "variant", variant_names
-        if len(columns) > max(MANY, len(rows)):
-            key, rows, other, columns = other, columns, key, rows
-        in_paper = set(part.dropna(subset="paper_mean")[other])
-        for name, heading in columns:
-            table.add_column(escape(heading), justify="right")
-            if name in in_paper:
-                table.add_column("paper", justify="right", style="dim")
-        scores = {(row[key], row[other]): row for row in part.to_dict("records")}
-        for name, heading in rows:
-            cells = []
-            for column, _ in columns:
-                row = scores.get((name, column))
-                cells.append("" if row is None else _own_score(row))
-                if column in in_paper:
-                    cells.append("" if row is None else _score(row["environment"], row["paper_mean"], row["paper_std"]))
-            table.add_row(escape(heading), *cells)
+        part = part.assign(cell=[_score(row) for row in part.to_dict("records")], task=part["environment"].map(task_name))
+        rows, columns = "task", "variant"
+        if part["variant"].nunique() > max(MANY, part["task"].nunique()):
+            rows, columns = columns, rows
+        matrix = part.pivot(index=rows, columns=columns, values="cell").fillna("")
+        matrix = matrix.loc[part[rows].unique(), part[columns].unique()]
+        table = Table("", title=f"{_steps(checkpoint)} steps scores")
+        for column in matrix:
+            table.add_column(escape(str(column)), justify="right")
+        for name, row in matrix.iterrows():
+            table.add_row(escape(str(name)), *row)
         tables.append(table)
     return tables
 
@@ -287,7 +156,7 @@ def _few(better: pd.DataFrame) -> pd.DataFrame:
 
 def footnotes(tables: Tables) -> list[str]:
     """How to read :func:`terminal_tables`, as far as something in them has to be explained."""
-    number, _, comparison, iqm, every = tables
+    _, _, iqm, every = tables
     better = _few(every)
     lines = []
     if (iqm["runs"] < 4).any():
@@ -305,38 +174,30 @@ def footnotes(tables: Tables) -> list[str]:
         lines.append("Each probability is over the tasks that both variants have runs on, which are not the same for all.")
     if better["p"].notna().any():
         lines.append("p: Mann and Whitney's, two-sided.")
-    if comparison["paper_mean"].notna().any():
-        lines.append(
-            f"Paper: table {number}. ▲ ▼: the difference from it is more than two standard errors of the difference, "
-            "2 sqrt(s²/n + S²/N)."
-        )
     return lines
 
 
 def as_data(tables: Tables) -> dict[str, Any]:
     """All that is shown, in plain values for JSON."""
-    number, runs, comparison, iqm, better = tables
+    runs, comparison, iqm, better = tables
     frames = {"scores": comparison, "interquartile_means": iqm, "improvements": better, "runs": runs}
     records = {name: json.loads(frame.to_json(orient="records", double_precision=15)) for name, frame in frames.items()}
-    return {"table": number, **records, "missing": missing(runs)}
+    return {**records, "missing": missing(runs)}
 
 
 def _steps(checkpoint: Any) -> str:
     return f"{checkpoint // 1000}K" if checkpoint % 1000 == 0 else f"{checkpoint:,}"
 
 
-def _score(environment: str, mean: float, std: float) -> str:
-    """As the paper prints it: integers, but three digits of what is normalized."""
-    if math.isnan(mean):
-        return "-"
-    digits = 0 if environment.startswith(PREFIX) else 3 if max(abs(mean), std) < 10 else 1
-    return f"{mean:.{digits}f}" if math.isnan(std) else f"{mean:.{digits}f} ± {std:.{digits}f}"
-
-
-def _own_score(row: dict[Any, Any]) -> str:
-    """With the number of runs where not all that are planned are there, and the mark."""
+def _score(row: dict[Any, Any]) -> str:
+    """Mean and deviation: integers on DeepMind Control; with the number of runs where some are missing."""
     number = "" if row["runs"] == row["planned"] else f" ({row['runs']}/{row['planned']})"
-    return f"{_score(row['environment'], row['mean'], row['std'])}{number} {MARKS[row['mark']]}".rstrip()
+    if row["runs"] == 0:
+        return f"-{number}"
+    spread = row["std"] if row["runs"] > 1 else 0.0
+    digits = 0 if row["environment"].startswith(PREFIX) else 3 if max(abs(row["mean"]), spread) < 10 else 1
+    deviation = f" ± {spread:.{digits}f}" if row["runs"] > 1 else ""
+    return f"{row['mean']:.{digits}f}{deviation}{number}"
 
 
 def _range(low: float, high: float, digits: str) -> str:
