@@ -1,7 +1,7 @@
 """Encoders: SB3 features extractors from observations to the latent states that the auxiliary loss works on."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch as th
 from gymnasium import spaces
@@ -26,14 +26,14 @@ class Encoder(BaseFeaturesExtractor, ABC):
     :param tanh: Whether to squash the latent state into (-1, 1)
     """
 
-    projection: nn.Sequential
+    projection: nn.Module
 
     def __init__(self, observation_space: spaces.Space, features_dim: int, trunk_dim: int, tanh: bool = False):
         super().__init__(observation_space, features_dim)
         self.trunk_dim = trunk_dim
         self.tanh = tanh
 
-    def make_projection(self) -> nn.Sequential:
+    def make_projection(self) -> nn.Module:
         """A new projection from the trunk to a latent state, with parameters of its own."""
         layers = [nn.Linear(self.trunk_dim, self.features_dim), nn.LayerNorm(self.features_dim)]
         return nn.Sequential(*layers, *([nn.Tanh()] if self.tanh else [])).apply(orthogonal_init)
@@ -171,7 +171,8 @@ class SimbaEncoder(Encoder):
     """
     Encoder in the manner of SimBa (Lee et al., 2024): running normalisation, a linear layer, residual blocks, layer norm.
 
-    All of it is the trunk, which the actor reads through a projection of its own; the latent state is the trunk's output.
+    All of it is the trunk, and the latent state is the trunk's output. The actor reads it as it is if it contains the
+    observation, else through a projection of its own.
 
     :param observation_space: Any space that SB3 can flatten
     :param features_dim: Width of the latent state and of all blocks; 128 was slower (results/agent/encoder_width)
@@ -196,7 +197,11 @@ class SimbaEncoder(Encoder):
         blocks = [SimbaBlock(features_dim) for _ in range(n_blocks)]
         self.layers = nn.Sequential(nn.Linear(inputs, features_dim), *blocks, nn.LayerNorm(features_dim))
         self.layers.apply(orthogonal_init)
-        self.projection = nn.Sequential()
+        self.projection = nn.Identity()
+
+    def make_projection(self) -> nn.Module:
+        # The observation needs none, and one of all of it would grow with its square.
+        return nn.Identity() if self.observation else super().make_projection()
 
     def trunk(self, observations: th.Tensor) -> th.Tensor:
         x = self.normalization(observations.reshape(observations.shape[0], -1))
@@ -210,11 +215,28 @@ VECTOR_ENCODERS: Mapping[str, type[DenseMLP] | type[SimbaEncoder]] = {
 }
 
 
+class SideBySide(nn.Module):
+    """
+    Modules that each read a part of the input, their outputs side by side.
+
+    :param modules: One for each part
+    :param widths: Widths of the parts
+    """
+
+    def __init__(self, modules: Sequence[nn.Module], widths: Sequence[int]):
+        super().__init__()
+        self.parts = nn.ModuleList(modules)
+        self.widths = list(widths)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return th.cat([part(y) for part, y in zip(self.parts, x.split(self.widths, dim=1), strict=True)], dim=1)
+
+
 class MultiInputEncoder(Encoder):
     """
     For Dict observations: a PixelEncoder for each image, one encoder for all other keys together.
 
-    Each part projects its own trunk; ``make_projection`` returns one projection of all trunks, for the actor.
+    Each part projects its own trunk, for the critic and again for the actor.
 
     :param observation_space: Dict of images and of anything that SB3 can flatten
     :param cnn_output_dim: Width of each image's latent state (table 7: 50; the name is SB3's CombinedExtractor's)
@@ -239,6 +261,9 @@ class MultiInputEncoder(Encoder):
         features_dim, trunk_dim = (sum(getattr(part, name) for part in encoders) for name in ("features_dim", "trunk_dim"))
         super().__init__(observation_space, features_dim, trunk_dim)
         self.image_keys, self.vector_keys = list(images), list(vectors)
+        self.projection = SideBySide([part.projection for part in encoders], [part.trunk_dim for part in encoders])
+        for encoder in encoders:
+            encoder.projection = nn.Identity()  # it is in self.projection
         self.encoders = nn.ModuleList(encoders)
 
     def _inputs(self, observations: TensorDict) -> list[th.Tensor]:
@@ -252,10 +277,9 @@ class MultiInputEncoder(Encoder):
         parts = zip(self.encoders, self._inputs(observations), strict=True)
         return th.cat([encoder.trunk(x) for encoder, x in parts], dim=1)  # type: ignore[operator]
 
-    def project(self, trunk: th.Tensor) -> th.Tensor:
+    def make_projection(self) -> SideBySide:
         encoders: list[Encoder] = list(self.encoders)  # type: ignore[arg-type]
-        parts = trunk.split([encoder.trunk_dim for encoder in encoders], dim=1)
-        return th.cat([encoder.project(part) for encoder, part in zip(encoders, parts, strict=True)], dim=1)
+        return SideBySide([part.make_projection() for part in encoders], [part.trunk_dim for part in encoders])
 
 
 # The names that plain YAML uses for features_extractor_class.

@@ -62,7 +62,7 @@ class Unseen(Own):
 
 
 class Image(Own):
-    observation_space = gym.spaces.Box(0, 255, (40, 40, 3), np.uint8)
+    observation_space = gym.spaces.Box(0, 255, (16, 16, 3), np.uint8)
 
     def reset(self, *, seed=None, options=None):
         return self.observation_space.sample(), super().reset(seed=seed)[1]

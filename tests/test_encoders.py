@@ -165,7 +165,8 @@ def test_multi_input_encoder_is_its_parts_side_by_side(
     inputs += [th.cat(flat, dim=1)] if flat else []
     kinds = [PixelEncoder if x.ndim == 4 else vector_encoder for x in inputs]
     assert [type(part) for part in encoder.encoders] == kinds
-    expected = [part(x) for part, x in zip(encoder.encoders, inputs, strict=True)]
+    trios = zip(encoder.projection.parts, encoder.encoders, inputs, strict=True)
+    expected = [projection(part.trunk(x)) for projection, part, x in trios]
     widths = {PixelEncoder: 5, SimbaEncoder: 4 + inputs[-1].shape[1]}  # simba's latent state contains the observation
     assert [latent.shape[1] for latent in expected] == [widths.get(kind, 4) for kind in kinds]
 
