@@ -19,7 +19,6 @@ import paper_tables
 import yaml
 from rich.table import Table
 from rich.text import Text
-from sb3_aarl.search.cli.results import ANALYSES, N_IMPORTANCES
 from sb3_aarl.search.execution.matrix import stored_scores, task_name
 from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
 from sb3_aarl.search.results import analysis, table
@@ -38,6 +37,16 @@ PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" /
 # What a search does to losses; the others are drawn at random, from priors, or given.
 EVOLVED = ("crossover", "replacement", "horizon_change")
 DRAWN, BEST = 20, 10
+# The tables of an analysis, and their titles.
+ANALYSES = {
+    "table5": "Patterns: mean score with - without (table 5; Welch's t-test: * p < 0.05, ** p < 0.01)",
+    "importances": "Importances of the tokens (mean decrease of impurity), the highest",
+    "horizon": "Scores by horizon; difference to all others",
+    "operator": "Scores by operator; difference to all others",
+    "operation": "Scores by operation; difference to all others",
+    "lineage": "Lineage of the best; gain over the better parent",
+    "machines": "Machines and time",
+}
 
 
 def texts() -> dict[Path, str]:
@@ -131,7 +140,7 @@ def run_row(path: Path, folder: Path, about: dict[str, Any]) -> list[str]:
 
 def search_tables(folder: Path) -> Iterator[str]:
     """
-    What the generations of a search found, its best losses, what ``aarl analyze`` shows, and the rankings of its matrices; of
+    What the generations of a search found, its best losses, what ``aarl report`` shows, and the rankings of its matrices; of
     a search with several seeds how well short runs rank losses.
     """
     study = load_study(open_storage(folder, create=False))
@@ -147,11 +156,11 @@ def search_tables(folder: Path) -> Iterator[str]:
     best = trials.nlargest(BEST, "score").to_dict("records")
     rows = [(row["number"], row["generation"], row["operation"], f"{row['score']:.0f}", f"`{row['loss']}`") for row in best]
     yield "## Best losses\n\n" + markdown([("trial", "generation", "operation", "score", "loss"), *rows])
-    found = analysis.summary(study.get_trials(deepcopy=False)).tables
+    found = analysis.summary(study.get_trials(deepcopy=False))
     for name, title in ANALYSES.items():
         if name in found:
-            frame = found[name].head(N_IMPORTANCES) if name == "importances" else found[name]
-            yield f"## {title}\n\n{from_frame(analysis.readable(name, frame))}"
+            frame = found[name].head(20) if name == "importances" else found[name]
+            yield f"## {title}\n\n{from_frame(analysis.readable(frame))}"
     for part in parts[1:]:
         if not (runs := stored_scores(folder / part)).empty:
             ranked = mean_scores(runs)

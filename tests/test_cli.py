@@ -141,7 +141,7 @@ def test_all_files_are_installed() -> None:
 def test_the_help_needs_nothing_heavy() -> None:
     program = (
         "import sys; from typer.testing import CliRunner; from sb3_aarl.search.cli.main import app; "
-        "[CliRunner().invoke(app, [*command, '--help']) for command in ([], ['figures'], ['search'], ['analyze'])]; "
+        "[CliRunner().invoke(app, [*command, '--help']) for command in ([], ['search'], ['table'], ['report'])]; "
         "print([name for name in ('torch', 'optuna', 'pandas', 'matplotlib') if name in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -343,6 +343,6 @@ def test_a_benchmark_grows_and_names_what_failed(folder: Path, executor: Planted
     assert "Failed: " not in run("benchmark", *options.split(), "--seeds", "0")
     output = run("benchmark", *options.split(), "--seeds", "0,1", code=1)
     assert output.count("Failed: ") == 2 and len(executor.runs) == 4
-    assert json.loads(run("table", "bench", "--json"))
+    assert json.loads(run("table", "bench", "--json", "--curves", "curves.png")) and Path("curves.png").exists()
     assert "evaluations" in run("benchmark", *options.replace("200,400", "100,400").split(), "--seeds", "0", code=2)
     assert "--every" in run("benchmark", *options.split(), "--every", "20k,30k", code=2)

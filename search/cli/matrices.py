@@ -183,5 +183,5 @@ def benchmark(
         show_costs(unfinished(matrix), workers)
         return
     train_matrix(matrix, workers)
-    table(folder, json)
+    table(folder, json=json)
     exit_if_failed(matrix)

@@ -1,6 +1,5 @@
 """Options that several commands have, and the folders and studies that they name."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,9 +29,6 @@ Benchmark = Annotated[Path, Argument(help="Folder of a benchmark.")]
 SearchFolder = Annotated[
     Path | None, Argument(help="Folder of a search, or its configuration file. Default: the only one in runs/.")
 ]
-SearchFolders = Annotated[
-    list[Path] | None, Argument(help="Folders of searches, or their configuration files. Default: the only one in runs/.")
-]
 Storage = Annotated[
     str | None,
     Option(
@@ -42,10 +38,6 @@ Storage = Annotated[
 ]
 Workers = Annotated[int, Option(help="Runs at the same time, each in a process of its own.", min=1)]
 Threads = Annotated[int | None, Option(help="Threads of each run. Default: the configuration's.", min=1)]
-Patterns = Annotated[
-    list[str] | None,
-    Option(help='A pattern beside those of table 5, in notation or by name, such as "{s_t} -> {r_t}"; may be repeated.'),
-]
 
 
 def modules(imports: str) -> list[str]:
@@ -75,17 +67,11 @@ def search_folder(folder: Path | None, storage: str | None) -> Path | None:
     return folders[0]
 
 
-def open_studies(folders: Sequence[Path | None] | None, storage: str | None) -> "dict[str, tuple[Study, Path]]":
-    """Studies and their folders by name; by folder where names are alike."""
+def open_study(folder: Path | None, storage: str | None) -> "tuple[Study, Path]":
+    """The study in a folder, or the one of the folder's name in a database, and its folder."""
     from sb3_aarl.search.execution.storage import load_study, open_storage
 
-    studies = {}
-    for folder in folders or [None]:
-        path = search_folder(folder, storage)
-        opened = open_storage(path, storage, create=False)
-        # The file in a folder has one study; of those in a database it is the one with the folder's name.
-        is_shared = storage is not None or len(opened.get_all_studies()) > 1
-        study = load_study(opened, path.name if path is not None and is_shared else None)
-        studies[path or Path("runs") / study.study_name] = study
-    alike = len({study.study_name for study in studies.values()}) < len(studies)
-    return {str(path) if alike else study.study_name: (study, path) for path, study in studies.items()}
+    path = search_folder(folder, storage)
+    opened = open_storage(path, storage, create=False)
+    study = load_study(opened, path.name if path is not None and storage is not None else None)
+    return study, path or Path("runs") / study.study_name

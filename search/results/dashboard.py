@@ -14,8 +14,8 @@ HOW_TO_READ = """\
 experience which others are predicted. Its value is the area under its learning curve, its note describes it.
 - **Generations**: the best quarter of a generation are the parents of the next. The trials' user attributes `generation`, \
 `operation` and `parents` show where a candidate comes from, the study's `settings` what is searched.
-- The parameters are one boolean for every token, so that their importances are the tokens'. `aarl figures evolution` draws \
-the scores by generation."""
+- The parameters are one boolean for every token, so that their importances are the tokens'. `aarl report` draws the \
+scores by generation."""
 
 
 def annotate_study(study: Study) -> None:

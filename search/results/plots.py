@@ -1,11 +1,9 @@
 """Figures of studies and benchmarks, as pure functions of their tables."""
 
 import math
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,19 +12,11 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from optuna.study import StudyDirection
 from sb3_aarl.search.results import analysis
 
-from sb3_aarl.aux_loss import AuxLoss
-
 BLUE, ORANGE = "#1f4e79", "#c55a11"
 COLOURS = (BLUE, ORANGE, "#000000", "#7f7f7f", "#6aa7d6")
 # Lines differ by dash and symbol, not by colour alone: they have to be told apart in grey.
 LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
 SYMBOLS = ("o", "s", "D", "^", "P", "X", "v")
-# Histograms lie on top of each other: the first is filled, the others are hatched and outlined.
-HISTOGRAMS: tuple[dict[str, Any], ...] = (
-    {"facecolor": "#d0d0d0", "edgecolor": "#7f7f7f", "linewidth": 1.0},
-    {"facecolor": "none", "edgecolor": BLUE, "linewidth": 1.4, "hatch": "///"},
-    {"facecolor": "none", "edgecolor": ORANGE, "linewidth": 1.4, "hatch": "...", "linestyle": "--"},
-)
 SCORE = "Score (AULC, mean return)"
 
 
@@ -38,7 +28,7 @@ def evolution_plot(
     """The score of every candidate by generation, beside baselines: the paper's figures 4 and 6, one panel a study."""
     baselines = {title: list(lines) for title, lines in (baselines or {}).items()}
     names = list(dict.fromkeys(name for lines in baselines.values() for name, _ in lines))
-    figure, panels = _panels(list(tables), SCORE, columns=3, width=4.4, height=3.6)
+    figure, panels = make_panels(list(tables), SCORE, columns=3, width=4.4, height=3.6)
     for axes, (title, table) in zip(panels, tables.items(), strict=True):
         trials = analysis.analysed(table)
         # Spread over the width of its generation by the golden ratio.
@@ -55,40 +45,20 @@ def evolution_plot(
         axes.set_xlim(generations.min() - 0.5, generations.max() + 0.5)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_xlabel("Generation")
-        axes.set_title(f"{title}\n{textwrap.fill(_counts(table), 60)}", fontsize=9)
-    _legend(figure, panels)
-    return figure
-
-
-def histogram_plot(tables: Mapping[str, pd.DataFrame]) -> Figure:
-    """The distributions of the scores of up to three studies: the paper's figure 7, with and without pruning of the space."""
-    if len(tables) > len(HISTOGRAMS):
-        raise ValueError(f"a histogram shows at most {len(HISTOGRAMS)} studies, not {len(tables)}: {', '.join(tables)}")
-    title = "\n".join(f"{name}: {_counts(table)}" for name, table in tables.items())
-    return _histograms({title: {name: analysis.analysed(table)["score"] for name, table in tables.items()}}, 6.4, 3.8)
-
-
-def patterns_plot(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = analysis.PATTERNS) -> Figure:
-    """The scores of the candidates with and without each pattern of table 5: the paper's figure 11."""
-    panels = {
-        f"{name}\nn = {len(scores_with)} with, {len(scores_without)} without": {"without": scores_without, "with": scores_with}
-        for name, (scores_with, scores_without) in analysis.pattern_scores(table, patterns).items()
-    }
-    figure = _histograms(panels, 3.1, 2.3)
-    figure.suptitle(_counts(table), fontsize=10)
+        axes.set_title(f"{title}\n{count_candidates(table)}", fontsize=9)
+    add_legend(figure, panels)
     return figure
 
 
 def learning_curves_plot(curves: pd.DataFrame, unit: str = "seed") -> Figure:
     """
-    Learning curves with their deviation over seeds, one panel a task: the paper's figure 9. Those of ``analysis.leaders`` are
-    its figure 10, where ``unit`` is a candidate.
+    Learning curves with their deviation over seeds, one panel a task: the paper's figure 9; ``unit`` is what a seed is.
 
     A point is drawn where all seeds of its variant and task have one. The shade is the standard deviation over the seeds;
     where there is one seed only, over its episodes.
     """
     tasks, variants = list(curves["env"].unique()), list(curves["variant"].unique())
-    figure, panels = _panels(tasks, "Return (mean ± std)", columns=4, width=3.3, height=2.7)
+    figure, panels = make_panels(tasks, "Return (mean ± std)", columns=4, width=3.3, height=2.7)
     for axes, task in zip(panels, tasks, strict=True):
         for position, variant in enumerate(variants):
             runs = curves[(curves["env"] == task) & (curves["variant"] == variant)]
@@ -108,11 +78,11 @@ def learning_curves_plot(curves: pd.DataFrame, unit: str = "seed") -> Figure:
         axes.set_xlabel("Environment steps", fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    _legend(figure, panels)
+    add_legend(figure, panels)
     return figure
 
 
-def _panels(titles: Sequence[str], label: str, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+def make_panels(titles: Sequence[str], label: str, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
     """A figure with a panel for each title, their vertical axis labelled once a row; width and height of a panel in inches."""
     columns = max(1, min(columns, len(titles)))
     rows = max(1, -(-len(titles) // columns))
@@ -133,7 +103,7 @@ def _panels(titles: Sequence[str], label: str, columns: int, width: float, heigh
     return figure, panels
 
 
-def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
+def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
     """One legend for all panels, each label once; what comes last."""
     entries: dict[str, Any] = {}
     for axes in panels:
@@ -149,29 +119,11 @@ def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
         text.set_parse_math(False)
 
 
-def _histograms(groups: Mapping[str, Mapping[str, pd.Series]], width: float, height: float) -> Figure:
-    """A panel for each title, with histograms in percent of each group and lines at their means."""
-    figure, panels = _panels(list(groups), "Share of each group (%)", 4, width, height)
-    every = [scores for panel in groups.values() for scores in panel.values()]
-    edges = np.histogram_bin_edges(np.concatenate([np.zeros(0), *every]), 20).tolist()
-    for axes, panel in zip(panels, groups.values(), strict=True):
-        for (label, scores), look, line in zip(panel.items(), HISTOGRAMS, ("-", "--", ":"), strict=False):
-            shares = np.full(len(scores), 100 / max(1, len(scores)))
-            axes.hist(scores, edges, weights=shares, histtype="stepfilled", label=label, **look)
-            if len(scores):
-                axes.axvline(scores.mean(), color=look["edgecolor"], ls=line, lw=2, label=f"{label}, mean")
-        axes.set_xlabel(SCORE, fontsize=9)
-    _legend(figure, panels)
-    return figure
-
-
-def _counts(table: pd.DataFrame) -> str:
-    """How many candidates a figure shows, and which trials it leaves out."""
-    counts = analysis.population(table)
-    words = {"fail": "failed", "unusable": "without score or loss"}
-    states = counts.drop(["trials", "analysed"])
-    left_out = [f"{count} {words.get(str(state), state)}" for state, count in states[states > 0].items()]
-    return f"{counts['analysed']} candidates" + (f" (left out: {', '.join(left_out)})" if left_out else "")
+def count_candidates(table: pd.DataFrame) -> str:
+    """How many candidates a figure shows, and how many trials it leaves out."""
+    n = len(analysis.analysed(table))
+    left_out = f", {len(table) - n} trials without a comparable score left out" if n < len(table) else ""
+    return f"{n} candidates{left_out}"
 
 
 def _seeds(curves: pd.DataFrame, unit: str) -> str:

@@ -3,7 +3,7 @@
 import io
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,12 @@ from matplotlib.figure import Figure
 from optuna import Study
 from sb3_aarl.search.execution.matrix import stored_scores, task_name
 from sb3_aarl.search.results import analysis
-from sb3_aarl.search.results.plots import evolution_plot, learning_curves_plot, patterns_plot
+from sb3_aarl.search.results.plots import evolution_plot
 from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.search import stored_settings
 from sb3_aarl.search.training.provenance import provenance
 
+from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.files import replace_text
 
 N_BEST = 10
@@ -37,7 +38,7 @@ def generation_table(table: pd.DataFrame) -> pd.DataFrame:
     trials = table[(table["state"] != "pruned") | table["loss"].notna()]
     scores = trials.groupby("generation")["score"].agg(average="mean", lowest="min", highest="max")
     states = pd.crosstab(trials["generation"], trials["state"])
-    return states.join(scores).join(analysis.diversity(table)[["distinct", "hamming"]])
+    return states.join(scores)
 
 
 def write_report(
@@ -45,6 +46,7 @@ def write_report(
     path: str | Path,
     baselines: Iterable[tuple[str, float]] = (),
     validation: pd.DataFrame | None = None,
+    patterns: Mapping[str, str | AuxLoss] = analysis.PATTERNS,
 ) -> None:
     """Write the report of a study, finished or not, with baselines and the runs of its cross-validation as one HTML file."""
     trials = study.get_trials(deepcopy=False)
@@ -55,9 +57,7 @@ def write_report(
         order = cross_validation.top_losses(study, len(best))
         best = best.drop_duplicates("canonical").sort_values("canonical", key=lambda losses: losses.map(order.index))
     title, baselines = study.study_name, list(baselines)
-    summary = analysis.summary(trials, study.direction)
-    n_analysed = len(analysis.analysed(table))
-    leaders = None if "rank_agreement" in summary.problems else analysis.leaders(table)
+    tables = analysis.summary(trials, study.direction, patterns)
     started = [f"{trial.datetime_start:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_start]
     ended = [f"{trial.datetime_complete:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_complete]
     environment = jinja2.Environment(
@@ -67,19 +67,16 @@ def write_report(
         study=study,
         settings=stored_settings(study),
         counts=Counter(table["state"]),
-        hours=summary.tables["machines"]["hours"].sum(),
-        generations=analysis.readable("generations", generation_table(table)),
+        hours=tables["machines"]["hours"].sum(),
+        generations=analysis.readable(generation_table(table)),
         baselines=baselines,
         evolution=_picture(evolution_plot({title: table}, {title: baselines}, study.direction)) if len(best) else None,
         best=_candidates(best[:N_BEST]),
         winner=_candidates(best[:1]).to_dict("records"),
-        lineage=_candidates(table.loc[summary.tables["lineage"].index[1:]]) if len(best) else None,
+        lineage=_candidates(table.loc[tables["lineage"].index[1:]]) if len(best) else None,
         validation=_validation(validation),
-        n_analysed=n_analysed,
-        tables={name: analysis.readable(name, frame) for name, frame in summary.tables.items()},
-        problems=summary.problems,
-        patterns=_picture(patterns_plot(table)) if n_analysed else None,
-        leaders=_picture(learning_curves_plot(leaders, "candidate")) if leaders is not None else None,
+        n_analysed=len(analysis.analysed(table)),
+        tables={name: analysis.readable(frame) for name, frame in tables.items()},
         started=min(started, default=""),
         ended=max(ended, default=""),
         versions=Counter(trial.user_attrs["versions"] for trial in trials if "versions" in trial.user_attrs),
@@ -90,7 +87,7 @@ def write_report(
 
 def _candidates(table: pd.DataFrame) -> pd.DataFrame:
     """Trials with their losses."""
-    text = analysis.readable("candidates", table.set_index("number")[["score", "generation", "operation", "parents"]])
+    text = analysis.readable(table.set_index("number")[["score", "generation", "operation", "parents"]])
     text.insert(0, "Loss", [Markup("<code>{}</code>").format(loss or "no loss") for loss in table["loss"]])
     return text
 
