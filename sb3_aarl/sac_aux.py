@@ -61,6 +61,10 @@ def _q_loss(q_values: Sequence[th.Tensor], target_q: th.Tensor) -> th.Tensor:
     return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
 
 
+def _shapes(parameters: Mapping[str, th.Tensor]) -> dict[str, th.Size]:
+    return {name: value.shape for name, value in parameters.items()}
+
+
 def default_learning_starts(total_timesteps: int) -> int:
     """Agent steps with random actions in a run of ``total_timesteps``, unless ``learning_starts`` says how many."""
     return min(5000, total_timesteps // 10)
@@ -604,23 +608,30 @@ class SACAux(SAC):
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
-        As in SB3. What belongs to an auxiliary loss that this model does not have is left out, with a warning; a loss that
-        the parameters know nothing of starts untrained, with a warning.
+        As in SB3. What belongs to an auxiliary loss that this model does not have is left out, and a loss that the
+        parameters do not fit starts untrained; both with a warning.
         """
         given: Any = load_path_or_dict
         if not isinstance(given, dict):
             given = load_from_zip_file(given, device=device, load_data=False)[1]
-        own, auxiliary = self.get_parameters(), {"aux_head", "aux_optimizer"}
-        surplus, missing = auxiliary & given.keys() - own.keys(), auxiliary & own.keys() - given.keys()
-        if surplus or (missing == auxiliary and exact_match):
-            text = "an auxiliary loss, which this model does not have" if surplus else "no auxiliary loss: it starts untrained"
-            logger.warning("the parameters are of a model with %s", text)
-            given = {name: value for name, value in given.items() if name not in surplus}
-            given |= {name: own[name] for name in missing}
-            key = "critic.optimizer"
-            if key in given and len(given[key]["param_groups"][0]["params"]) != len(own[key]["param_groups"][0]["params"]):
-                # With aux_kwargs=dict(joint=True) the auxiliary optimizer has the encoder's part of the state.
-                given[key] = own[key]
+        own, auxiliary, problem = self.get_parameters(), {"aux_head", "aux_optimizer"}, None
+        if self.aux_head is None and auxiliary & given.keys():
+            problem = "an auxiliary loss, which this model does not have"
+        elif self.aux_head is not None and not auxiliary & given.keys() and exact_match:
+            problem = "no auxiliary loss: it starts untrained"
+        elif "aux_head" in own.keys() & given.keys() and _shapes(own["aux_head"]) != _shapes(given["aux_head"]):
+            problem = "another auxiliary loss or predictor: it starts untrained"
+        given = dict(given)
+        if problem:
+            logger.warning("the parameters are of a model with %s", problem)
+            given = {name: value for name, value in given.items() if name not in auxiliary}
+            given |= {name: own[name] for name in auxiliary & own.keys()}
+        sizes = [
+            len(some["critic.optimizer"]["param_groups"][0]["params"]) for some in (own, given) if "critic.optimizer" in some
+        ]
+        if len(set(sizes)) > 1:
+            # With aux_kwargs=dict(joint=True) the auxiliary optimizer has the encoder's part of the state.
+            given["critic.optimizer"] = own["critic.optimizer"]
         super().set_parameters(given, exact_match, device)
 
     def __getstate__(self) -> dict[str, Any]:

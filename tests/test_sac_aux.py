@@ -628,11 +628,14 @@ def test_parameters_include_the_auxiliary_ones(joint: bool) -> None:
 
 @pytest.mark.parametrize("joint", [False, True])
 def test_loading_without_the_loss_or_with_one(joint: bool, tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Back to plain SAC after pre-training, and the other way round: all but the auxiliary loss is loaded, with a warning."""
-    for before, after, text in ((LOSS, None, "which this model does not have"), (None, LOSS, "it starts untrained")):
+    """Back to plain SAC after pre-training, the other way round, another loss: all but it is loaded, with a warning."""
+    other = "{s_t} -> {r_t} [bilinear, negatives]"
+    texts = {(LOSS, None): "which this model does not have", (None, LOSS): "it starts untrained", (LOSS, other): "another"}
+    for (before, after), text in texts.items():
         trained = make_model(aux_loss=before, aux_kwargs={"joint": joint}).learn(40)
         trained.save(tmp_path / "model")
-        loaded = SACAux.load(tmp_path / "model", make_env("state"), aux_loss=after)
+        # Whether one optimizer trains both may change, too.
+        loaded = SACAux.load(tmp_path / "model", make_env("state"), aux_loss=after, aux_kwargs={"joint": after == other})
         given = make_model(aux_loss=after, aux_kwargs={"joint": joint}, seed=9)
         given.set_parameters(trained.get_parameters(), exact_match=before is None)
         for model in (loaded, given):
