@@ -2,7 +2,7 @@
 A search for losses on an environment of one's own, from Python, with an executor of one's own.
 
 One sees which runs start, how far each generation is, and the best loss: four runs, one to two minutes on two cores. Scores of
-so short runs mean little. The same command resumes the search; `aarl dashboard runs/examples/search` shows it.
+so short runs mean little. The same command resumes the search.
 
     python examples/search_from_python.py
 """

@@ -12,7 +12,6 @@ import optuna
 import pytest
 import yaml
 from executors import Planted
-from optuna.storages import BaseStorage
 from optuna.trial import TrialState, create_trial
 from sb3_aarl.search.cli.main import app
 from sb3_aarl.search.evolution.space import distributions, loss_to_params
@@ -148,19 +147,6 @@ def test_the_help_needs_nothing_heavy() -> None:
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("name", ["runs/some", "elsewhere/some.yml"])
-def test_dashboard_finds_a_search_by_its_folder_and_by_its_file(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    optuna.create_study(study_name="some", storage=open_storage(Path("runs/some")))
-    served = []
-
-    def serve(storage: BaseStorage, host: str, port: int) -> None:
-        served.append((optuna.get_all_study_names(storage), host, port))
-
-    monkeypatch.setattr("optuna_dashboard.run_server", serve)
-    run("dashboard", name, "--port", 8123)
-    assert served == [(["some"], "127.0.0.1", 8123)]
-
-
 @pytest.mark.parametrize(
     ("environment", "options", "message"),
     [
@@ -193,7 +179,7 @@ def test_a_folder_is_that_of_one_search(folder: Path, executor: Planted) -> None
     shutil.copy("small.yml", "other.yml")
     assert "mine is the folder of the search small" in run("search", "other.yml", "--folder", "mine", code=2)
     assert "small" in run("cross-validate", "other.yml", "--folder", "mine", code=2)
-    assert "mine, search" in run("status", "small.yml", "--folder", "mine")
+    assert "Search mine" in run("status", "small.yml", "--folder", "mine")
 
 
 def test_errors_have_no_password(folder: Path) -> None:
@@ -215,7 +201,7 @@ def test_search_reports_progress_and_resumes(folder: Path, executor: Planted) ->
     output = run("search", "small.yml", "--generations", 1, "--threads", 2, "--workers", 3)
     assert executor.arguments == (3,) and {run.threads for run in executor.runs} == {2}
     assert "generation 1: 2/2 done, 0 running, 0 failed; best 1.00, finished" in output
-    assert "aarl dashboard runs/small" in output and "score 1.00" in output
+    assert "optuna-dashboard sqlite:///runs/small/study.db" in output and "score 1.00" in output
     output = run("search", "small.yml", "--threads", 2)
     assert "generation 1: 2/2 done" in output and "generation 2: 2/2 done" in output and len(executor.runs) == 4
     study = optuna.load_study(study_name="small", storage=open_storage(Path("runs/small")))

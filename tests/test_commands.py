@@ -56,11 +56,6 @@ class Own(gym.Env):
         return self.np_random.integers(0, 256, (32, 32, 3), np.uint8)
 
 
-class Unseen(Own):
-    def __init__(self):
-        pass
-
-
 class Image(Own):
     observation_space = gym.spaces.Box(0, 255, (16, 16, 3), np.uint8)
 
@@ -76,10 +71,8 @@ class Parts(Image):
 
 
 gym.register("Shown-v0", Own, max_episode_steps=20)
-gym.register("Unseen-v0", Unseen, max_episode_steps=20)
 gym.register("Image-v0", Image, max_episode_steps=20)
 gym.register("Parts-v0", Parts, max_episode_steps=20)
-gym.register("Blind-v0", type("Blind", (Own,), {"metadata": {}}), max_episode_steps=20)
 """
 
 
@@ -92,13 +85,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run(*arguments: object, code: int = 0, stdout: bool = False) -> str:
+def run(*arguments: object, code: int = 0) -> str:
     """What the program prints, which must end with an exit code; errors are one line."""
     result = runner.invoke(app, [str(argument) for argument in arguments])
     assert result.exit_code == code, result.output
     if code == 2:
         assert len(result.stderr.strip().splitlines()) == 1, result.stderr
-    return result.stdout if stdout else result.output
+    return result.output
 
 
 @pytest.mark.parametrize(
@@ -142,10 +135,9 @@ def test_a_search_may_name_a_shipped_file_or_none(folder: Path) -> None:
 
 
 def test_configs_lists_all_files_with_their_first_line() -> None:
-    shown, data = run("configs"), json.loads(run("configs", "--json"))
-    assert set(data["searches"]) == set(shipped_files(True)) and set(data["hyper-parameters"]) == set(shipped_files(False))
-    for name, line in {**data["searches"], **data["hyper-parameters"]}.items():
-        assert re.search(rf"{re.escape(name)} +│ +{re.escape(line)}", shown) and line
+    shown = run("configs")
+    for name in [*shipped_files(True), *shipped_files(False)]:
+        assert re.search(rf"│ {re.escape(name)} +│ +\w", shown)
 
 
 @pytest.mark.slow
@@ -168,14 +160,12 @@ def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path, monkeypatc
     monkeypatch.setattr("sb3_aarl.search.studies.cost.measure", lambda run: measured.setdefault("small", measure(run)))
     output = run("search", "small.yml", "--workers", 4, "--dry-run")
     row = next(line for line in output.splitlines() if line.startswith("│ small"))
-    runs, steps, gradient_steps, *shown, _ = map(float, row.replace("│", "").split()[1:])
-    # 2 random ones and a prior, then 3; two seeds. Training begins after 40 steps.
-    assert (runs, steps, gradient_steps) == (12, 400, 360)
-    names = ("ms an environment step", "ms a gradient step", "hours of a run")
-    step_ms, gradient_ms, hours = (measured["small"][name] for name in names)
-    # And two evaluations of an episode of 200 steps.
-    assert hours == pytest.approx((800 * step_ms + 360 * gradient_ms) / 3.6e6)
-    assert shown == [float(f"{value:.2g}") for value in (step_ms, gradient_ms, hours, 12 * hours)]
+    runs, gradient_ms, hours, _, core_hours = map(float, row.replace("│", "").split()[2:])
+    # 2 random ones and a prior, then 3; two seeds.
+    assert runs == 12 and gradient_ms == float(f"{measured['small']['ms a gradient step']:.2g}")
+    # Training begins after 40 of 400 steps; there are two evaluations of an episode of 200 steps.
+    assert measured["small"]["hours"] > 360 * measured["small"]["ms a gradient step"] / 3.6e6
+    assert (hours, core_hours) == tuple(float(f"{n * measured['small']['hours']:.2g}") for n in (1, 12))
     assert "All: 12 runs" in output and "with --workers 4" in output
     assert not Path("runs").exists()
 
@@ -194,18 +184,14 @@ def test_status_of_a_search_and_its_baselines(folder: Path, executor: Planted) -
     write_search(folder, BASELINES)
     executor.scores = {None: 3.0}
     run("search", "small.yml", "--generations", 1, "--workers", 2)
-    shown, data = run("status", "small.yml"), json.loads(run("status", "runs/small", "--json"))
-    assert re.search(r"generation 1 +│ +3 │ +3 │ +0 │ +0 │", shown)
-    assert data["search"]["best_loss"] in shown and f"score {data['search']['best']:.2f}; finished" in shown
+    shown = run("status", "small.yml")
+    assert shown == run("status", "runs/small")
+    assert "generation 1: 3/3 done, 0 running, 0 failed" in shown and "finished" in shown
     write_search(folder, BASELINES + "overrides: {gamma: 0.5}\n")
     assert "it was started with gamma=None, not 0.5" in run("baselines", "small.yml", code=2)
     write_search(folder, BASELINES)
     run("baselines", "small.yml")
-    shown, data = run("status"), json.loads(run("status", "small", "--json"))
-    assert {row["variant"] for row in json.loads(run("baselines", "small.yml", "--json", stdout=True))} == {"CURL", "SAC"}
-    score = np.mean([point.mean for point in read_curve("runs/small/baselines/SAC/Pendulum-v1/seed-0/curve.csv")])
-    assert [row["variant"] for row in data["baselines"]["variants"]] == ["CURL", "SAC"]
-    assert re.search(rf"SAC +│ +1 │ +1 │ +0 │ +0 │ +{score:.2f} ", shown)
+    assert re.search(r"SAC +│ +1 │ +1 │ +0 │ +0 │", run("status"))
 
 
 @pytest.mark.parametrize("sampler", [AuxLossSampler(seed=0, population_size=2, n_random=2, n_prior=0), RandomSampler(seed=0)])
@@ -220,11 +206,10 @@ def test_status_of_a_study_made_in_python(sampler: BaseSampler) -> None:
         storage=open_storage(Path("runs/own")), sampler=sampler, direction="maximize", study_name="own"
     )
     study.optimize(objective, 40, catch=ValueError, callbacks=[lambda study, trial: trial.value is None or study.stop()])
-    data = json.loads(run("status", "own", "--json"))["search"]
-    (generation,) = data["generations"]
-    assert (generation["running"], generation["filled"]) == (0, len(study.trials) - generation["failed"])
-    assert data["best"] == study.best_value and not data["runs"]
-    assert f"score {study.best_value:.2f}" in run("status", "own")
+    shown = run("status", "own")
+    progress = re.search(r"generation 1: (\d+)/\d+ done, 0 running, (\d+) failed", shown)
+    assert progress is not None and sum(map(int, progress.groups())) == len(study.trials)
+    assert f"best {study.best_value:.2f}" in shown
 
 
 def test_status_of_a_benchmark(folder: Path) -> None:
@@ -236,11 +221,10 @@ def test_status_of_a_benchmark(folder: Path) -> None:
     Path("bench/some/Pendulum-v1/seed-1/failed.json").write_text('{"reason": "it burst", "retry": false}')
     with FileLock("bench/some/Pendulum-v1/seed-2/lock"):
         shown = run("status", "bench")
-    assert re.search(r"some +│ +3 │ +1 │ +1 │ +1 │ +-\d+\.\d\d │", shown)
-    assert re.search(r"Benchmark: 0:00:\d\d to go", shown)
+    assert re.search(r"some +│ +3 │ +1 │ +1 │ +1 │", shown) and re.search(r"bench, 0:\d\d:\d\d to go", shown)
     shutil.copy("bench/some/Pendulum-v1/seed-1/failed.json", "bench/some/Pendulum-v1/seed-2")
     shutil.rmtree("bench/some/Pendulum-v1/seed-0")
-    assert "Benchmark: finished" in run("status", "bench")
+    assert "bench, finished" in run("status", "bench")
     assert "neither" in run("status", "nowhere", code=2)
 
 
@@ -295,8 +279,6 @@ def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
     (trained / "model.zip").rename("alone.zip")
     assert "which environment?" in run("evaluate", "alone.zip", code=2)
     assert "spaces do not match" in run("evaluate", "alone.zip", "Pendulum-v1", code=2)
-    assert "Unseen-v0 cannot be made" in run("video", "alone.zip", "Unseen-v0", code=2)
-    assert "Blind-v0 has no pictures" in run("video", "alone.zip", "Blind-v0", code=2)
     assert "no_env cannot be imported" in run("evaluate", "alone.zip", "Shown-v0", "--imports", "no_env", code=2)
     assert "model.zip does not exist" in run("video", trained, code=2)
 
@@ -305,8 +287,6 @@ def test_training_on_an_environment_of_ones_own(folder: Path) -> None:
     (folder / "imported_env.py").write_text(OWN_ENV.replace("Shown-v0", "Imported-v0"))
     arguments = ["train", "Imported-v0", "--steps", 300, "--evaluations", 1, "--episodes", 1, "--folder", "run"]
     assert "unknown environment 'Imported-v0'" in run(*arguments, code=2)
-    (folder / "study.db").touch()
-    assert ". is the folder of a search" in run("train", "Pendulum-v1", "--folder", ".", code=2)
     run(*arguments, "--imports", "imported_env")
     assert read_curve("run/curve.csv")[-1].environment_steps == 300
 

@@ -447,7 +447,7 @@ def test_a_run_too_short_to_learn_is_said_before_it_starts(caplog: pytest.LogCap
     ],
 )
 def test_a_rollout_is_an_interval(hyper: dict[str, Any], interval: int) -> None:
-    assert checkpoint_interval(hyper) == interval
+    assert checkpoint_interval(hyper, "here") == interval
 
 
 @given(st.integers(1, 10**6), st.integers(1, 30), st.integers(1, 16))

@@ -22,7 +22,6 @@ from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.config import SearchConfig, load_config
 from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, runs_of
-from sb3_aarl.search.studies.status import matrix_status
 from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError
 from tiny import SEARCH, write_search
@@ -138,8 +137,8 @@ def test_a_file_is_read_once_and_its_settings_are_checked_once(
     search.run(executor)
     baselines(search.config, tmp_path)
     assert [Path(path).name for (path,) in read] == ["small.yml", "hyperparameters.yml"]
-    # Two environments, and the overrides of a baseline.
-    assert len(checked) == 3
+    # Two environments, and the overrides of a baseline on both.
+    assert len(checked) == 4
 
 
 def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None:
@@ -204,8 +203,6 @@ def test_a_search_on_several_environments_and_of_hyperparameters(tmp_path: Path,
     assert list(matrix.runs) == [Cell("CURL", task, 0) for task in tasks]
     list(run_matrix(matrix, executor))
     assert stored_baselines(tmp_path / "mine") == [("CURL", 0.75)]
-    table, _ = matrix_status(matrix.folder)
-    assert list(table["score"]) == [0.75]
     validation = cross_validation.make_matrix(search.config, search.study, tmp_path / "mine")
     assert [cell[1:] for cell in validation.runs] == [(task, seed) for seed in (0, 1, 2) for task in tasks]
     assert [run.checkpoints[-1] for run in validation.runs.values()] == [400, 200] * 3
@@ -242,14 +239,14 @@ def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, capl
         "Pendulum-v1": (200, 400),
         "MountainCarContinuous-v0": (100,),
     }
-    assert config.cross_validation is not None and "as the search" not in caplog.text
+    assert config.cross_validation is not None and "seeds of the search" not in caplog.text
     longer = config.cross_validation.model_copy(update={"checkpoints": {"Pendulum-v1": (800,)}})
     matrix = cross_validation.make_matrix(config.model_copy(update={"cross_validation": longer}), study, tmp_path)
     assert {run.checkpoints for run in matrix.runs.values() if run.environment == "Pendulum-v1"} == {(800,)}
     same = config.cross_validation.model_copy(update={"seeds": (0, 2)})
     more = {"cross_validation": same, "threads": 2, "generations": 3}
     cross_validation.make_matrix(config.model_copy(update=more), study, tmp_path, top=1)
-    assert "seeds has 0, as the search" in caplog.text
+    assert "seeds has seeds of the search" in caplog.text
     with pytest.raises(ConfigError, match="cross_validation is missing"):
         cross_validation.make_matrix(config.model_copy(update={"cross_validation": None}), study, tmp_path)
 
@@ -316,6 +313,4 @@ def test_new_seeds_go_to_those_that_could_still_be_the_best(config: SearchConfig
     assert runs[str(losses[0])] > 6 and runs[str(losses[1])] > 6
     assert sum(runs.values()) - runs["CURL"] == 2 * 14
     assert table["p_best"].nlargest(2).sum() > 0.99
-    with pytest.raises(ConfigError, match=r"cross_validation.budget: must be at least 8, .*not 7"):
-        load_config(config.path, cross_validation={**section, "budget": 7})
     assert len(cross_validation.all_runs(raced)) == 2 * 14 + 2 * 2 * 2

@@ -168,7 +168,7 @@ def test_tables_7_and_8(variant: str) -> None:
 
 def test_ten_operators_on_forward_dynamics() -> None:
     variants = read_variants(ZOO / "paper" / "operators.yml")
-    losses = {name: AuxLoss.parse(changes["aux_loss"]) for name, _, _, changes in variants}
+    losses = {variant.name: AuxLoss.parse(variant.entries["default"]["aux_loss"]) for variant in variants}
     forward = catalog.load("forward-dynamics")
     assert losses == {
         f"forward_{operator}{'_negatives' * negatives}": replace(forward, operator=operator, negatives=negatives)

@@ -33,11 +33,6 @@ def say_json(data: Any) -> None:
     say(json.dumps(data, indent=1))
 
 
-def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
-    """The rows of a table in plain values for JSON, names of rows included."""
-    return json.loads(frame.reset_index().to_json(orient="records", double_precision=15))
-
-
 @contextlib.contextmanager
 def live() -> Iterator[Callable[[str, object], None]]:
     """
@@ -93,24 +88,19 @@ def print_wide(table: Table) -> None:
 def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
     """Measure one run of each kind, and show what all of them would cost, beside each other where there are cores for them."""
     import pandas as pd
-    from sb3_aarl.search.studies.cost import costs
+    from sb3_aarl.search.studies.cost import measure
 
     if not kinds:
         say("All runs are finished.")
         return
     say(f"Measuring some seconds of each kind of run ({len(kinds)}) ...")
-    measured = costs(kinds)
-    formats = dict.fromkeys(("runs", "environment steps", "gradient steps"), "{:,}")
-    formats |= dict.fromkeys(("ms an environment step", "ms a gradient step", "hours of a run", "core hours"), "{:.2g}")
-    formats["MB of buffer"] = "{:,.1f}"
-    table = pd.DataFrame({name: measured[name].map(text.format) for name, text in formats.items()})
-    table.columns = table.columns.str.replace(" ", "\n")
-    table.insert(0, "", list(kinds))
-    show_table(table, "Measured here")
-    n_runs = measured["runs"].sum()
-    hours = (measured["runs"] * measured["hours of a run"]).sum() / min(workers, n_runs)
-    memory = measured["MB of buffer"].max() * min(workers, n_runs)
+    table = pd.DataFrame([{"": name, "runs": len(runs), **measure(runs[0])} for name, runs in kinds.items()])
+    table["core hours"] = table["runs"] * table["hours"] * [runs[0].threads for runs in kinds.values()]
+    show_table(table.map(lambda value: f"{value:.2g}" if isinstance(value, float) else str(value)), "Measured here")
+    n_runs = table["runs"].sum()
+    hours = (table["runs"] * table["hours"]).sum() / min(workers, n_runs)
+    memory = table["MB of buffer"].max() * min(workers, n_runs)
     say(
-        f"All: {n_runs} runs, {measured['core hours'].sum():.2g} core hours; {hours:.2g} hours and at most {memory:,.1f} MB "
+        f"All: {n_runs} runs, {table['core hours'].sum():.2g} core hours; {hours:.2g} hours and at most {memory:,.1f} MB "
         f"of buffers with --workers {workers}. Starting each takes some seconds more. Nothing was started."
     )

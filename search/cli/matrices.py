@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from sb3_aarl.search.cli import options
-from sb3_aarl.search.cli.console import errors, live, records, say, say_json, show_costs, show_table, time_to_go
+from sb3_aarl.search.cli.console import errors, live, say, show_costs, show_table, time_to_go
 from sb3_aarl.search.cli.options import Folder, Json, SearchFile, Storage, Threads, Workers, modules
 from sb3_aarl.search.training.shipped import find_file
 
@@ -42,15 +42,13 @@ def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
     return kinds
 
 
-def compare(matrix: "Matrix", title: str, json: bool) -> "pd.DataFrame":
+def compare(matrix: "Matrix", title: str) -> "pd.DataFrame":
     """Show the ranking of the variants that can be compared, and return it."""
     from sb3_aarl.search.execution.matrix import scores, task_name
     from sb3_aarl.search.studies.cross_validation import ranking
 
     ranked = ranking(scores(matrix))
-    if json:
-        say_json(records(ranked))
-    elif not ranked.empty:
+    if not ranked.empty:
         shown = ranked.map("{:.3f}".format).replace("nan", "-").assign(runs=ranked["runs"].map(str))
         show_table(shown.rename(columns=task_name).reset_index(), title)
     return ranked
@@ -71,9 +69,7 @@ def exit_if_failed(matrix: "Matrix") -> None:
 
 
 @app.command(rich_help_panel="A search")
-def baselines(
-    config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None, json: Json = False
-) -> None:
+def baselines(config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None) -> None:
     """Train the baselines of a search, which its candidates are compared with."""
     from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
     from sb3_aarl.search.studies import search
@@ -86,7 +82,7 @@ def baselines(
         search.check_study(load_study(open_storage(searched.folder), settings.name), settings, free=("threads",))
     matrix = search.baselines(settings, searched.folder)
     train_matrix(matrix, workers, settings.retries, config)
-    compare(matrix, "Baselines, AULC", json)
+    compare(matrix, "Baselines, AULC")
     exit_if_failed(matrix)
 
 
@@ -101,7 +97,6 @@ def cross_validate(
     workers: Workers = 1,
     threads: Threads = None,
     folder: Folder = None,
-    json: Json = False,
 ) -> None:
     """Train the best candidates of a search on several environments, and write the winner as YAML."""
     from sb3_aarl.search.execution.storage import load_study, open_storage
@@ -114,14 +109,13 @@ def cross_validate(
     matrix = cross_validation.make_matrix(settings, searched, path, top, settings.baselines if with_baselines else ())
     for part in cross_validation.rounds(settings, matrix):
         train_matrix(part, workers, settings.retries, config)
-    table = compare(matrix, "Cross-validation, AULC: posterior mean, 95 % interval, probability to be the best", json)
+    table = compare(matrix, "Cross-validation, AULC: posterior mean, 95 % interval, probability to be the best")
     names = [baseline.name for baseline in settings.baselines]
     if not (candidates := table.drop(index=names, errors="ignore")).empty:
         winner = cross_validation.write_winner(candidates, path / "winner.yml")
-        if not json:
-            say(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}")
-            if table["mean"].iloc[0] > candidates["mean"].iloc[0]:
-                say(f"The mean of {table.index[0]}, a baseline, is higher.")
+        say(f"Winner: {winner}\nAs YAML: {path / 'winner.yml'}")
+        if table["mean"].iloc[0] > candidates["mean"].iloc[0]:
+            say(f"The mean of {table.index[0]}, a baseline, is higher.")
     exit_if_failed(matrix)
 
 

@@ -1,12 +1,11 @@
-"""Commands that show what is stored and train nothing: table, status, report, dashboard."""
+"""Commands that show what is stored and train nothing: table, status, report."""
 
-from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from sb3_aarl.search.cli import options
-from sb3_aarl.search.cli.console import console, print_wide, records, say, say_json, show_table, time_to_go
+from sb3_aarl.search.cli.console import console, print_wide, say, say_json, show_table, time_to_go
 from sb3_aarl.search.cli.options import Folder, Storage, open_study, search_folder
 
 app = typer.Typer()
@@ -46,46 +45,28 @@ def status(
     ] = None,
     storage: Storage = None,
     folder: Folder = None,
-    json: options.Json = False,
 ) -> None:
     """Show how far a search, what belongs to it, or a benchmark is: runs done, running, failed, best so far, time to go."""
-    import pandas as pd
+    from sb3_aarl.search.cli.search import progress_line
     from sb3_aarl.search.execution.storage import STUDY_FILE, open_storage
     from sb3_aarl.search.studies.status import PARTS, matrix_status, search_status
 
-    folder = folder or search
-    path = search_folder(folder, storage)
-    data: dict[str, Any] = {}
-    lines = []
-    tables: dict[str, pd.DataFrame] = {}
+    path = search_folder(folder or search, storage)
+    found = False
     if storage is not None or path is None or (path / STUDY_FILE).exists():
-        study, path = open_study(folder, storage)
+        study, path = open_study(path, storage)
         progress, runs = search_status(study, open_storage(path, storage, create=False), path)
-        data["search"] = {**progress._asdict(), "generations": [row._asdict() for row in progress.generations], "runs": runs}
-        rows = [(f"generation {row.generation}", *row[1:]) for row in progress.generations]
-        tables["search"] = pd.DataFrame(rows, columns=["variant", "runs", "done", "running", "failed"])
-        best = "nothing yet" if progress.best is None else f"{progress.best_loss}, score {progress.best:.2f}"
-        complete = all(row.filled == row.slots for row in progress.generations)
-        how = (
-            time_to_go(progress.seconds_to_go) if runs or complete else "no driver runs here: the same aarl search resumes it"
-        )
-        lines.append(f"Search: best {best}; {how}")
+        is_over = all(row.filled == row.slots for row in progress.generations)
+        hint = "" if runs or is_over else "\nNo driver runs here: the same aarl search resumes it."
+        say(f"Search {path}\n{progress_line(progress).replace('; ', chr(10))}, {progress.best_loss}{hint}")
+        found = True
     for part in ("", *PARTS):
         variants, to_go = matrix_status(path / part)
         if not variants.empty:
-            name = part or "benchmark"
-            data[name] = {"variants": records(variants.set_index("variant")), "seconds_to_go": to_go}
-            tables[name] = variants.assign(score=variants["score"].map("{:.2f}".format).replace("nan", "-"))
-            lines.append(f"{name.capitalize()}: {time_to_go(to_go)}")
-    if not tables:
+            show_table(variants.astype(str), f"{path / part}, {time_to_go(to_go)}")
+            found = True
+    if not found:
         raise ValueError(f"{path} has neither a search nor a benchmark. aarl search starts one")
-    if json:
-        say_json(data)
-        return
-    for title, table in tables.items():
-        show_table(table.astype(str), f"{path}, {title}")
-    for line in lines:
-        say(line)
 
 
 @app.command(rich_help_panel="A search")
@@ -111,23 +92,3 @@ def report(
     patterns = {**PATTERNS, **{text: text for text in pattern or ()}}
     write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"), patterns)
     say(f"Report: {out}")
-
-
-@app.command(rich_help_panel="A search")
-def dashboard(
-    search: options.SearchFolder = None,
-    storage: Storage = None,
-    folder: Folder = None,
-    host: Annotated[
-        str, typer.Option(help="Address to listen on; the default is reached from this machine only.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
-) -> None:
-    """Watch a search in optuna-dashboard. Everybody who reaches it can change and delete studies."""
-    from optuna_dashboard import run_server
-    from sb3_aarl.search.execution.storage import open_storage
-
-    opened = open_storage(search_folder(folder or search, storage), storage, create=False)
-    say(f"http://{host}:{port}/  (Ctrl-C to stop; --port for another port)")
-    with suppress(KeyboardInterrupt):
-        run_server(opened, host=host, port=port)

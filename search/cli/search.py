@@ -69,7 +69,8 @@ def search(
             say(f"This counts all that the file says, also what is done: aarl status {path}")
         return
     options = "" if storage is None else f" --storage {hide_password(storage)}"
-    say(f"Study {found.study.study_name}. To watch it: aarl dashboard {path}{options}")
+    url = hide_password(storage or f"sqlite:///{path / STUDY_FILE}")
+    say(f"Study {found.study.study_name}. To watch it: optuna-dashboard {url}")
     running: Any
     cpus, gpus = cpus_per_run or 1, gpus_per_run or 0
     if executor == "ray":
@@ -101,17 +102,14 @@ def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
     from sb3_aarl.search.studies import cross_validation
     from sb3_aarl.search.studies.search import all_runs, baselines
 
-    kinds: dict[str, list[Run]] = {}
-    for run in all_runs(config):
-        task = f": {task_name(run.environment)}" if len(config.tasks) > 1 else ""
-        kinds.setdefault(config.name + task, []).append(run)
-    for cell, run in baselines(config, Path()).runs.items():
-        task = f", {task_name(run.environment)}" if len(config.tasks) > 1 else ""
-        kinds.setdefault(f"baselines: {cell.variant}{task}", []).append(run)
+    runs: list[tuple[str, Run]] = [(config.name, run) for run in all_runs(config)]
+    runs += [(f"baselines: {cell.variant}", run) for cell, run in baselines(config, Path()).runs.items()]
     names = {baseline.name for baseline in config.baselines}
     for cell, run in cross_validation.all_runs(config).items() if config.cross_validation else ():
-        baseline = f", {cell.variant}" if cell.variant in names else ""
-        kinds.setdefault(f"cross-validate: {task_name(cell.environment)}{baseline}", []).append(run)
+        runs.append((f"cross-validate: {cell.variant if cell.variant in names else 'candidates'}", run))
+    kinds: dict[str, list[Run]] = {}
+    for name, run in runs:
+        kinds.setdefault(f"{name}, {task_name(run.environment)}", []).append(run)
     return kinds
 
 

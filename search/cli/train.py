@@ -39,7 +39,6 @@ def train(
     threads: Annotated[int, typer.Option(help="Threads of PyTorch.", min=1)] = 1,
     folder: Annotated[Path | None, typer.Option(help="Folder for model and learning curve. Default: in runs/.")] = None,
     imports: Imports = "",
-    json: Json = False,
 ) -> None:
     """Train with one auxiliary loss. After a kill the same command resumes from the last evaluation."""
     from sb3_aarl.search.execution.queue import seconds_to_go
@@ -63,9 +62,6 @@ def train(
         planned = ", ".join(f"{point:,}" for point in read_run(path).checkpoints)
         errors.print(f"Into {path}; evaluations, from which it can be resumed, at {planned} environment steps")
     curve = train_run(path, bar, on_evaluation)
-    if json:
-        say_json({"folder": str(path), "aulc": aulc(curve), "curve": [point._asdict() for point in curve]})
-        return
     title = f"Mean of the evaluations (AULC) {aulc(curve):.1f}"
     table = Table("environment steps", "mean return", "deviation", "seconds", title=title)
     for column in table.columns:
@@ -78,41 +74,30 @@ def train(
 
 @app.command(rich_help_panel="One agent")
 def losses(
-    published: Annotated[bool, typer.Option("--published", help="The paper's candidates too.")] = False, json: Json = False
+    published: Annotated[bool, typer.Option("--published", help="The paper's candidates too.")] = False,
 ) -> None:
     """List the losses that have a name."""
     from sb3_aarl import catalog
 
     names = [*catalog.names(), *(candidate.name for candidate in catalog.published() if published)]
-    named = {name: catalog.load(name) for name in names}
-    if json:
-        say_json({name: str(loss) for name, loss in named.items()})
-        return
     table = Table("name", "notation")
     table.columns[1].overflow = "fold"
-    for name, loss in named.items():
-        table.add_row(name, escape(str(loss)))
+    for name in names:
+        table.add_row(name, escape(str(catalog.load(name))))
     console.print(table)
 
 
 @app.command(rich_help_panel="One agent")
-def configs(json: Json = False) -> None:
+def configs() -> None:
     """List the configurations that come with the package, for commands that take a file."""
     from sb3_aarl.search.training.shipped import shipped_files
 
     kinds = {"Hyper-parameters: aarl train --hyperparams NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
-    files = {
-        title: {name: first_sentence(path) for name, path in shipped_files(searches).items()}
-        for title, searches in kinds.items()
-    }
-    if json:
-        say_json({title.partition(":")[0].lower(): names for title, names in files.items()})
-        return
-    for title, names in files.items():
+    for title, searches in kinds.items():
         table = Table("name", "what it is", title=title, title_justify="left")
         table.columns[0].no_wrap = True
-        for row in names.items():
-            table.add_row(*row)
+        for name, path in shipped_files(searches).items():
+            table.add_row(name, first_sentence(path))
         (console.print if console.is_terminal else print_wide)(table)
 
 

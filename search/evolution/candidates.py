@@ -58,21 +58,17 @@ class Settings:
         self._later = [name for name, count in counts.items() for _ in range(count)]
 
     def _check_arguments(self, shares: dict[str, float]) -> None:
-        positive = {name: getattr(self, name) for name in ("population_size", "max_horizon", "screening", "n_generations")}
-        positive["n_random + n_prior + initial"] = self.n_random + self.n_prior + len(self.initial)
-        for name, number in positive.items():
-            if number is not None and number < 1:
-                raise ValueError(f"{name} must be at least 1, not {number}")
-        others = {"n_random": self.n_random, "n_prior": self.n_prior, "seed": self.seed, "again": self.again}
-        for name, number in {**shares, **others}.items():
-            if number is not None and not number >= 0:
-                raise ValueError(f"{name} must not be negative, not {number}")
+        least = dict.fromkeys(("population_size", "max_horizon", "screening", "n_generations"), 1)
+        least |= dict.fromkeys((*shares, "n_random", "n_prior", "seed", "again"), 0)
+        for name, low in least.items():
+            if (number := getattr(self, name)) is not None and not number >= low:
+                raise ValueError(f"{name} must be at least {low}, not {number}")
+        if not (self.n_random or self.n_prior or self.initial):
+            raise ValueError("n_random, n_prior and initial must not all be empty")
         if abs(sum(shares.values()) - 1) > 1e-9:
             raise ValueError(f"the shares {', '.join(shares)} must sum to 1, not {sum(shares.values())}")
-        if not 0 < self.parents <= 1:
-            raise ValueError(f"parents must be a share in (0, 1], not {self.parents}")
-        if self.again > 1:
-            raise ValueError(f"again must be a share in [0, 1], not {self.again}")
+        if not 0 < self.parents <= 1 or self.again > 1:
+            raise ValueError(f"parents and again must be shares up to 1, not {self.parents} and {self.again}")
         if self.parent_selection not in get_args(ParentSelection):
             raise ValueError(f"parent_selection must be best or posterior, not {self.parent_selection!r}")
         space.check_operators(self.operators)
@@ -108,8 +104,7 @@ class Candidates:
     The candidates of one study.
 
     They are planned in rounds. Round g starts when generation g - 1 is over. It has the slots of generation g that need
-    parents (in the first one all), and then the random ones of generation g + 1. It knows nothing of its own results, so
-    that the plan does not depend on the order in which trials finish.
+    parents (in the first one all), and then the random ones of generation g + 1. It knows none of its own results.
     """
 
     def __init__(self, settings: Settings, seed: int):

@@ -1,7 +1,4 @@
-"""
-The paper's mutations of an auxiliary loss (section 2.2, figure 3, A.3), as pure functions: a ValueError where the offspring is
-not valid, and is to be redrawn. Beside them that of other parameters, which the paper does not search.
-"""
+"""The paper's mutations of a loss (section 2.2, figure 3, A.3), and of other parameters. A ValueError: to be redrawn."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,8 +12,8 @@ from sb3_aarl.aux_loss import AuxLoss
 
 def replacement(loss: AuxLoss, rng: np.random.Generator, operators: Sequence[str] | None = None) -> AuxLoss:
     """
-    Flip each bit of both masks with probability 1 / (2 (3k + 1)), k being the horizon, independently. Where operators are
-    searched too (the paper does not say how), the operator is redrawn and negatives are switched with the same probability.
+    Flip each bit of both masks with probability 1 / (2 (3k + 1)), k being the horizon. Where operators are searched too (the
+    paper does not say how), the operator is redrawn and negatives are switched with the same probability.
     """
     flip_rate = 1 / (2 * (3 * loss.horizon + 1))
     flips = rng.random((2, 3 * loss.horizon + 1)) < flip_rate

@@ -14,12 +14,8 @@ RATIOS = np.logspace(-2, 2, 41)
 
 class Standings(NamedTuple):
     """
-    What is known of the true value (the mean over all seeds) of each loss; NaN, and probability 0, for one without any run.
-
-    :param mean: Posterior mean, nearer to the mean of all losses than that of the scores: the less is known, the nearer
-    :param low: Lower end of its interval
-    :param high: Upper end of its interval
-    :param p_best: Probability to be the best of these losses
+    What is known of the true value of each loss, its mean over all seeds: the posterior mean, its interval from ``low`` to
+    ``high``, and the probability that it is the best of these losses. NaN, and probability 0, for one without any run.
     """
 
     mean: np.ndarray
@@ -29,12 +25,7 @@ class Standings(NamedTuple):
 
 
 def standings(scores: np.ndarray, level: float = 0.95) -> Standings:
-    """
-    The standings of losses after some runs.
-
-    :param scores: Scores of losses (rows) and seeds (columns), NaN where there is none
-    :param level: Probability of the intervals
-    """
+    """The standings of losses (rows) with these scores of seeds (columns), NaN where there is none."""
     scores = np.asarray(scores, dtype=float)
     has_runs = ~np.isnan(scores).all(axis=1)
     mean, low, high = np.full((3, len(scores)), np.nan)

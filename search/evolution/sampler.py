@@ -32,7 +32,7 @@ LOCK = threading.Lock()
 
 
 class GenerationProgress(NamedTuple):
-    """How many slots a generation has, and how many are filled or have a running trial; how many trials have failed."""
+    """How many slots of a generation there are, are filled, or have a running trial, and how many trials have failed."""
 
     generation: int
     slots: int
@@ -53,20 +53,15 @@ class AuxLossSampler(Settings, BaseSampler):
     A trial gets its slot when it is asked for, and shows it in its user attributes ``generation``, ``slot``, ``attempt``,
     ``operation`` and ``parents``. Its loss depends on the seed, the slot and earlier generations, not on the number of trials
     that run at once. A failed trial, or one that is pruned before it has a loss, frees its slot for another candidate; for the
-    same one if it has the user attribute ``interrupted``. A trial that is enqueued with parameters of a loss takes a random
-    slot if there is one, and the others of its parameters are drawn at random.
+    same one if it has the user attribute ``interrupted``. Enqueued parameters of a loss take a random slot if there is one.
 
     Trials that are pruned, have no finite score or violate a constraint (``trial.set_constraint``) are parents only if there
-    are no others in their generation. What is searched beside the loss is inherited from a parent and, every other time,
-    changed. Other samplers may hold this one (``PartialFixedSampler``, ``independent_sampler``): the loss of a trial is the
-    one that its parameters name.
+    are no others. What is searched beside the loss is inherited from a parent and, every other time, changed. Other samplers
+    may hold this one (``PartialFixedSampler``, ``independent_sampler``): the loss of a trial is the one of its parameters.
 
-    Two processes that share a study draw for one slot if they ask at the same moment. They train one loss, and the trial that
-    finishes first counts.
-
-    Asking never waits. A trial that finds no free slot gets one more offspring of the last parents and a slot number behind
-    all others; it counts if it finishes before its generation is over. Trials of a killed program stay RUNNING and hold their
-    slots: report ``TrialState.FAIL`` for them.
+    Asking never waits. A trial that finds no free slot gets an extra one, with one more offspring of the last parents. Two
+    processes that ask at the same moment may train one slot's loss twice; the trial that finishes first counts. Trials of a
+    killed program stay RUNNING and hold their slots: report ``TrialState.FAIL`` for them.
 
     :param population_size: Slots of every generation but the first (paper: 100)
     :param n_random: Random losses of the first generation (paper: 100)

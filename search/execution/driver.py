@@ -40,12 +40,7 @@ class RunFailed(RuntimeError):
 
 
 class SearchProgress(NamedTuple):
-    """
-    :param generations: Progress of each generation
-    :param best: Best score so far
-    :param best_loss: Its loss
-    :param seconds_to_go: Estimated seconds until the search is complete, None while that is not known
-    """
+    """Progress of each generation, best score so far and its loss, and the estimated seconds to go, None if not known."""
 
     generations: list[GenerationProgress]
     best: float | None
@@ -55,10 +50,7 @@ class SearchProgress(NamedTuple):
 
 @dataclass
 class RunningTrial:
-    """
-    A trial, its runs on the environments that are not reached yet, its jobs on those that are done and on the one that is
-    trained on (one for each seed), and the number of evaluations reported to Optuna.
-    """
+    """A trial, its runs on later environments, its jobs on those that are done and on this one, and the number of reports."""
 
     trial: optuna.Trial
     waiting: list[list[Run]]
@@ -84,7 +76,6 @@ class Driver:
     :param folder: Folder of the search
     :param workers: Runs that are at the executor at the same time
     :param retries: How often a run is resubmitted
-    :param on_change: Called with a trial when it starts, when it is reported, and before it is told
     :param returns: The returns that count as 0 and 1 on each environment, None where they count as they are
     """
 
@@ -95,7 +86,6 @@ class Driver:
     folder: Path
     workers: int = 1
     retries: int = 3
-    on_change: Callable[[optuna.Trial], None] = lambda trial: None
     returns: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -160,17 +150,11 @@ class Driver:
             logger.warning("Trial %d: %s", trial.number, problem)
             self._tell(trial, state=TrialState.PRUNED)
             return
-        attributes = {
-            "loss": runs[0].aux_loss,
-            "commit": commit(),
-            "versions": versions(),
-            "threads": runs[0].threads,
-        }
-        self._note(trial, attributes)
+        of_run = {"loss": runs[0].aux_loss, "threads": runs[0].threads}
+        self._note(trial, {**of_run, "commit": commit(), "versions": versions()})
         tasks = [list(task) for _, task in groupby(runs, lambda run: run.environment)]
         self.running[trial.number] = RunningTrial(trial, tasks)
         self._submit(self.running[trial.number])
-        self._patiently(self.on_change, trial)
 
     def _submit(self, running: RunningTrial) -> None:
         """Submit a candidate's runs on its next environment."""
@@ -204,7 +188,6 @@ class Driver:
                 self._note(trial, {"scores": dict(zip(names, of_tasks, strict=True))})
                 self._patiently(trial.report, score, len(of_tasks))
             if running.waiting and not self._patiently(trial.should_prune):
-                self._patiently(self.on_change, trial)
                 self._submit(running)
                 return
             is_whole = not running.waiting
@@ -219,11 +202,11 @@ class Driver:
 
     def _curves(self, jobs: Sequence[Job]) -> list[list[Evaluation]]:
         """The curves of jobs so far, on the scale of their environments' returns."""
-        found = []
+        curves = []
         for job in jobs:
             returns, curve = self.returns.get(job.run.environment), job.curve if job.is_over else partial_curve(job.folder)
-            found.append([point._replace(mean=scaled(point.mean, returns)) for point in curve])
-        return found
+            curves.append([point._replace(mean=scaled(point.mean, returns)) for point in curve])
+        return curves
 
     def _note_runs(self, trial: optuna.Trial, jobs: Sequence[Job]) -> None:
         """Note the mean curve, if all environments have the same checkpoints, and how long the runs took on which machine."""
@@ -236,14 +219,11 @@ class Driver:
 
     def _report(self, running: RunningTrial, curve: list[list[float]]) -> None:
         """Report the mean over the seeds of each step that all of them have evaluated."""
-        trial, news = running.trial, curve[running.n_reported :]
-        for steps, mean in news:
-            self._patiently(trial.report, mean, int(steps))
+        for steps, mean in curve[running.n_reported :]:
+            self._patiently(running.trial.report, mean, int(steps))
             running.n_reported += 1
-            if steps != running.jobs[0].run.checkpoints[-1] and self._patiently(trial.should_prune):
+            if steps != running.jobs[0].run.checkpoints[-1] and self._patiently(running.trial.should_prune):
                 running.stop()
-        if news:
-            self._patiently(self.on_change, trial)
 
     def _fail(self, trial: optuna.Trial, reason: str) -> None:
         logger.warning("Trial %d failed: %s", trial.number, reason)
@@ -259,7 +239,6 @@ class Driver:
             self._patiently(trial.set_user_attr, name, value)
 
     def _tell(self, trial: optuna.Trial, values: float | None = None, state: TrialState | None = None) -> None:
-        self._patiently(self.on_change, trial)
         self._patiently(self.study.tell, trial, values, state, skip_if_finished=True)
         self.running.pop(trial.number, None)
 

@@ -27,11 +27,9 @@ class Executor(Protocol):
 
 def start_run(folder: str) -> dict[str, Any]:
     """
-    Train the run of a folder in a process of its own, which ends when this one does, and wait for it.
+    Train the run of a folder (an absolute path, after ``prepare_run``) in a process of its own, which ends when this one does,
+    and wait for it. It is the one function that executors get. A run that is finished is read, not trained again.
 
-    It is the one function that executors get. A run that is finished is read, not trained again.
-
-    :param folder: Absolute path of a folder that ``prepare_run`` has prepared
     :return: Plain values: ``curve`` (rows of ``Evaluation``), ``failure`` (None, or the reason in one line) and ``retry``
         (whether the failure was not the candidate's fault)
     """

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.queue import Queue, pace, seconds_to_go
+from sb3_aarl.search.training.config import check_checkpoints
 from sb3_aarl.search.training.folder import FAILED, Run, is_finished, partial_curve, prepare_run, read_outcome
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
 from sb3_aarl.search.training.setup import check_run
@@ -80,14 +81,15 @@ def cell_folder(folder: Path, cell: Cell) -> Path:
 
 def check_matrix(matrix: Matrix, source: str = "") -> None:
     """
-    Make environment and model of one of the runs that have the same hyper-parameters, unless it is finished: on each
-    environment that may be of the user's own, and on one task of DeepMind Control.
+    Check the checkpoints of all runs, and try out one of those that have the same hyper-parameters, unless it is finished: on
+    each environment that may be of the user's own, and on one task of DeepMind Control.
 
-    :param source: Where the hyper-parameters are from, for runs whose ``abouts`` name no ``file``
-    :raises ConfigError: naming the file, when a run cannot be trained
+    :param source: The file of their settings, for runs whose ``abouts`` name none
+    :raises ConfigError: when a run cannot be trained
     """
     checked = set()
     for cell, run in matrix.runs.items():
+        check_checkpoints(run.checkpoints, run.hyperparameters, f"{cell.variant} on {cell.environment}")
         environment = PREFIX if run.environment.startswith(PREFIX) else run.environment
         settings = {**run.hyperparameters, "n_timesteps": None}
         kind = environment, run.aux_loss is None, json.dumps(settings)
@@ -98,12 +100,9 @@ def check_matrix(matrix: Matrix, source: str = "") -> None:
 
 def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: int = 3) -> Iterator[MatrixProgress]:
     """
-    Train the runs that are not finished. Several programs may share a matrix: the lock of each folder decides.
+    Train the runs that are not finished, ``workers`` at the same time. Several programs may share a matrix: the lock of each
+    folder decides.
 
-    :param matrix: The runs
-    :param executor: Where they are executed
-    :param workers: Runs that are at the executor at the same time
-    :param retries: How often a run is resubmitted
     :raises ValueError: before anything is trained, when a folder has a run with other settings
     """
     folders = {cell: cell_folder(matrix.folder, cell) for cell in matrix.runs}
@@ -138,8 +137,8 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
 
 def scores(matrix: Matrix) -> pd.DataFrame:
     """
-    The runs that are over: one row each with ``variant``, ``environment``, ``seed``, ``score`` (AULC, on the scale of
-    ``returns`` where ``provenance.json`` has them) and ``last`` (mean return at the last checkpoint); NaN where a run failed.
+    The runs that are over: one row each with ``variant``, ``environment``, ``seed``, ``score``: the AULC, on the scale of
+    ``returns`` where ``provenance.json`` has them; NaN where a run failed.
     """
     return _scores((cell, cell_folder(matrix.folder, cell)) for cell in matrix.runs)
 
@@ -155,8 +154,7 @@ def _scores(runs: Iterable[tuple[Cell, Path]]) -> pd.DataFrame:
     for cell, path in runs:
         outcome = read_outcome(path) if path.exists() else None
         if outcome is not None and outcome.failure is None:
-            score = scaled(aulc(outcome.curve), read_about(path).get("returns"))
-            rows.append((*cell, score, outcome.curve[-1].mean))
+            rows.append((*cell, scaled(aulc(outcome.curve), read_about(path).get("returns"))))
         elif outcome is not None:
-            rows.append((*cell, math.nan, math.nan))
-    return pd.DataFrame(rows, columns=[*Cell._fields, "score", "last"])
+            rows.append((*cell, math.nan))
+    return pd.DataFrame(rows, columns=[*Cell._fields, "score"])

@@ -39,12 +39,8 @@ class Job:
 
 class Queue:
     """
-    Runs that are submitted to an executor in the order in which they were added. A run whose process is killed, or that fails
-    for reasons outside of it, is resubmitted.
-
-    :param executor: Where runs are executed
-    :param workers: Number of runs at the executor at the same time
-    :param retries: How often a run is resubmitted
+    Runs that are submitted to an executor in the order in which they were added, ``workers`` at the same time. A run whose
+    process is killed, or that fails for reasons outside of it, is resubmitted ``retries`` times at most.
     """
 
     def __init__(self, executor: Executor, workers: int = 1, retries: int = 3):
@@ -102,11 +98,8 @@ def pace(run: Run, curve: Sequence[Evaluation]) -> tuple[float, float | None]:
 
 def seconds_to_go(seconds: Sequence[float], left: float, at_once: int) -> float | None:
     """
-    Estimated seconds until all runs (or candidates) are over, None if unknown.
-
-    :param seconds: Seconds of some of them
-    :param left: Number of those that are left, counting the remaining shares of started ones
-    :param at_once: Number of those that run at the same time
+    Estimated seconds until all runs (or candidates) are over, None if unknown: from the seconds of some of them, how many are
+    left (with the remaining shares of started ones), and how many run at once.
     """
     if left == 0:
         return 0.0

@@ -22,10 +22,9 @@ SQLITE_TIMEOUT = 120
 
 def open_storage(folder: Path | None, url: str | None = None, create: bool = True) -> RDBStorage:
     """
-    Open the storage of a search.
+    Open the storage of a search: ``study.db`` in its folder, or the database of a URL such as ``postgresql://user@host/db``;
+    passwords are better kept in ``PGPASSWORD``.
 
-    :param folder: Folder of the search, whose ``study.db`` is used unless a URL is given
-    :param url: URL of a database, such as ``postgresql://user@host/db``; passwords are better kept in ``PGPASSWORD``
     :param create: Whether to make a file of SQLite that is not there
     :raises ValueError: when there is neither a study's file nor a URL
     """
@@ -44,11 +43,7 @@ def open_storage(folder: Path | None, url: str | None = None, create: bool = Tru
 
 
 def load_study(storage: RDBStorage, name: str | None = None) -> optuna.Study:
-    """
-    Load a study.
-
-    :raises ValueError: naming the studies that are there, when it is not one of them
-    """
+    """Load a study by its name, or the only one; a ValueError names those that are there."""
     names = optuna.get_all_study_names(storage)
     if name is None and len(names) == 1:
         name = names[0]

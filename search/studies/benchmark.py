@@ -13,8 +13,6 @@ from sb3_aarl.search.execution.matrix import Cell, Matrix, task_name
 from sb3_aarl.search.training.config import (
     ConfigError,
     action_repeat,
-    check_checkpoints,
-    check_hyperparameters,
     entry_of,
     import_modules,
     merge,
@@ -51,17 +49,12 @@ class Experiment(BaseModel, extra="forbid"):
 
 
 class Variant(NamedTuple):
-    """Hyper-parameters with a name: those of a file, or a base and what differs from it."""
+    """Hyper-parameters by environment with a name, the file that they are from, and what messages call them."""
 
     name: str
     file: Path
     entries: Mapping[str, Any]
-    changes: Mapping[str, Any]
-
-    def hyperparameters(self, env_id: str) -> dict[str, Any]:
-        """The hyper-parameters for an environment."""
-        entry = entry_of(self.entries, env_id, str(self.file))
-        return check_hyperparameters(merge(entry, self.changes), env_id, f"{self.file}: {self.name}")
+    source: str
 
 
 def read_experiment(path: Path) -> Experiment:
@@ -73,11 +66,14 @@ def read_variants(path: Path) -> list[Variant]:
     """The variants in a file: those of a ``variants.yml``, or one with the name of a file of hyper-parameters."""
     entries = read_yaml(path)
     if "variants" not in entries:
-        return [Variant(path.stem, path, entries, {})]
+        return [Variant(path.stem, path, entries, str(path))]
     experiment = read_experiment(path)
     base = experiment.base
     entries = read_yaml(find_file(Path(base), folder=path.parent)) if isinstance(base, str) else base
-    return [Variant(name, path, entries, changes) for name, changes in experiment.variants.items()]
+    return [
+        Variant(name, path, {env_id: merge(entry, changes) for env_id, entry in entries.items()}, f"{path}: {name}")
+        for name, changes in experiment.variants.items()
+    ]
 
 
 def load_benchmark(
@@ -110,7 +106,7 @@ def load_benchmark(
     ids = list(dict.fromkeys(map(resolve_env_id, environments or _common_environments(variants))))
     # SACAux's default, written out: a variant that names no loss is not one that says "none".
     hyperparameters = {
-        (variant.name, env_id): {"aux_loss": "auto", **variant.hyperparameters(env_id)}
+        (variant.name, env_id): {"aux_loss": "auto", **entry_of(variant.entries, env_id, variant.source)}
         for variant, env_id in product(variants, ids)
     }
     compared = {env_id: tuple(sorted(set(checkpoints))) or _default_checkpoints(env_id, hyperparameters) for env_id in ids}
@@ -122,7 +118,6 @@ def load_benchmark(
         settings, steps = hyperparameters[cell[:2]], compared[environment]
         between = () if every is None else range(every, steps[-1], every)
         evaluations = tuple(sorted({*steps, *between}))
-        check_checkpoints(evaluations, settings, f"{variant.name} on {environment}")
         loss = settings["aux_loss"]
         runs[cell] = Run(
             environment=environment,
@@ -150,27 +145,24 @@ def load_benchmark(
 
 def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     """
-    The ``provenance.json`` of a benchmark's runs, by their folders, if each run is there once and all can be compared.
+    The ``provenance.json`` of a benchmark's runs, by their folders.
 
     :param folder: Folder of a benchmark, or of an experiment, which has a ``variants.yml``
+    :raises ValueError: when a run is there twice
     """
     abouts: dict[Path, dict[str, Any]] = {}
     folders: dict[Cell, Path] = {}
-    trained: dict[tuple[str, str], Path] = {}
     experiment = folder / VARIANTS
     parts = (RUNS, *read_experiment(experiment).runs) if experiment.exists() else ("",)
     for path in sorted(file.parent for part in parts for file in (folder / part).rglob(ABOUT)):
         about = {"sessions": [], **read_about(path)}
-        if not {*Cell._fields, "checkpoints"} <= about.keys():
-            raise ValueError(f"{path / ABOUT} is not that of a benchmark's run")
+        if "checkpoints" not in about:  # of another matrix
+            continue
         abouts[path] = about
         cell = Cell(*(about[name] for name in Cell._fields))
         other = folders.setdefault(cell, path)
         if other != path:
             raise ValueError(f"{other} and {path} have the same run: {cell.variant} on {cell.environment}, seed {cell.seed}")
-        other = trained.setdefault((cell.variant, cell.environment), path)
-        if difference := _difference(abouts[other], about):
-            raise ValueError(f"{other} and {path} cannot be compared: {'{}={!r} and {!r}'.format(*difference)}")
     return abouts
 
 

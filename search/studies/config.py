@@ -22,7 +22,7 @@ from pydantic import (
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import MAX_HORIZON, loss_to_params
 from sb3_aarl.search.training import config as training
-from sb3_aarl.search.training.config import ConfigError, check_checkpoints
+from sb3_aarl.search.training.config import ConfigError
 from sb3_aarl.search.training.shipped import find_file
 
 from sb3_aarl import catalog
@@ -36,8 +36,9 @@ def _ascending(steps: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _different(items: tuple[Any, ...]) -> tuple[Any, ...]:
-    if not items or len(set(items)) < len(items):
-        raise ValueError(f"must have at least one item, and none twice, not {list(items)}")
+    names = [getattr(item, "name", getattr(item, "environment", item)) for item in items]
+    if not items or len(set(names)) < len(names):
+        raise ValueError(f"must have at least one item, and none twice, not {names}")
     return items
 
 
@@ -115,15 +116,6 @@ class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     returns: dict[Environment, Returns] = {}
     budget: PositiveInt | None = None
 
-    @field_validator("budget")
-    @classmethod
-    def _is_enough(cls, budget: int | None, info: ValidationInfo) -> int | None:
-        if budget is not None and {"top", "top_rated", "seeds"} <= info.data.keys():
-            least = (info.data["top"] + info.data["top_rated"]) * len(info.data["seeds"])
-            if budget < least:
-                raise ValueError(f"must be at least {least}, for the seeds of all candidates, not {budget}")
-        return budget
-
 
 class Baseline(BaseModel, frozen=True, extra="forbid"):
     """
@@ -168,7 +160,7 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     # Fields are validated in this order: validators of later ones use earlier ones.
     path: Annotated[Path, AfterValidator(Path.absolute)]
     imports: Annotated[tuple[str, ...], AfterValidator(training.import_modules)] = ()
-    environments: Annotated[tuple[Task, ...], Field(validate_default=True)] = ()
+    environments: Annotated[tuple[Task, ...], AfterValidator(_different)] = ()
     environment: Annotated[Environment | None, Field(validate_default=True)] = None
     hyperparameters: Path | None = None
     checkpoints: Checkpoints
@@ -195,19 +187,12 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     threads: PositiveInt = 1
     pruner: Literal["none", "median", "hyperband"] = "none"
     cross_validation: CrossValidation | None = None
-    baselines: tuple[Baseline, ...] = ()
+    baselines: Annotated[tuple[Baseline, ...], AfterValidator(_different)] = ()
     overrides: Overrides = {}
     space: dict[str, Annotated[Any, PlainValidator(_distribution)]] = {}
     # The file of hyper-parameters, read once, and checked hyper-parameters by environment and baseline.
     _file: dict[str, Any] = PrivateAttr(default_factory=dict)
     _checked: dict[tuple[str, str | None], dict[str, Any]] = PrivateAttr(default_factory=dict)
-
-    @field_validator("environments")
-    @classmethod
-    def _environments_differ(cls, tasks: tuple[Task, ...]) -> tuple[Task, ...]:
-        if tasks:
-            _different(tuple(task.environment for task in tasks))
-        return tasks
 
     @field_validator("environment")
     @classmethod
@@ -235,13 +220,6 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
         else:
             return (catalog.resolve(value),)
         return tuple(loss for loss in losses if _is_searched(loss, info.data))
-
-    @field_validator("baselines")
-    @classmethod
-    def _names_differ(cls, baselines: tuple[Baseline, ...]) -> tuple[Baseline, ...]:
-        if baselines:
-            _different(tuple(baseline.name for baseline in baselines))
-        return baselines
 
     @property
     def name(self) -> str:
@@ -315,12 +293,9 @@ def load_config(path: str | Path, **changes: Any) -> SearchConfig:
     section = config.cross_validation
     validated = (section.environments or tuple(config.tasks)) if section else ()
     for env_id in dict.fromkeys([*config.tasks, *validated]):
-        for baseline in (None, *(config.baselines if env_id in config.tasks else ())):
-            steps = set(config.checkpoints_on(env_id) if env_id in config.tasks else ())
-            if section and env_id in validated:
-                steps |= {*section.checkpoints.get(env_id, config.checkpoints_on(env_id))}
-            check_checkpoints(steps, config.hyperparameters_for(env_id, baseline), f"{path}: {env_id}")
-        if config.environments and env_id in validated and config.returns_on(env_id) is None:
+        for baseline in (None, *config.baselines):
+            config.hyperparameters_for(env_id, baseline)
+        if config.environments and config.returns_on(env_id) is None:
             raise ConfigError(f"{path}: cross_validation.returns: {env_id} is missing, with the returns that count as 0 and 1")
     for name, distribution in config.space.items():
         ends = getattr(distribution, "choices", None) or (distribution.low, distribution.high)

@@ -1,10 +1,8 @@
 """The cost of runs on this machine, measured on one of each kind."""
 
 import time
-from collections.abc import Mapping, Sequence
 from contextlib import closing
 
-import pandas as pd
 import torch as th
 from sb3_aarl.search.training.folder import Run
 from sb3_aarl.search.training.setup import Setup
@@ -47,19 +45,7 @@ def measure(run: Run) -> dict[str, float]:
         arrays = [*(store.frames for store in buffer.stores.values()), *(getattr(buffer, name) for name in ARRAYS)]
         share = min(1.0, setup.agent_steps / buffer.buffer_size / env.num_envs)  # it takes memory as it fills
     return {
-        "environment steps": run.checkpoints[-1],
-        "ms an environment step": 1000 * agent_step / setup.action_repeat,
-        "gradient steps": round(n_updates),
         "ms a gradient step": 1000 * gradient_step,
-        "hours of a run": ((setup.agent_steps + evaluated) * agent_step + n_updates * gradient_step) / 3600,
+        "hours": ((setup.agent_steps + evaluated) * agent_step + n_updates * gradient_step) / 3600,
         "MB of buffer": share * sum(array.nbytes for array in arrays) / 1e6,
     }
-
-
-def costs(kinds: Mapping[str, Sequence[Run]]) -> pd.DataFrame:
-    """
-    One row for each kind of runs: ``runs``, ``threads`` of one, what :func:`measure` returns of the first one, and
-    ``core hours`` of all.
-    """
-    found = pd.DataFrame([{"runs": len(runs), "threads": runs[0].threads, **measure(runs[0])} for runs in kinds.values()])
-    return found.assign(**{"core hours": found["runs"] * found["threads"] * found["hours of a run"]})

@@ -56,13 +56,8 @@ def make_matrix(
     """
     section = _section(config)
     check_study(study, config, free=("threads",))
-    if own := sorted({*config.seeds} & {*section.seeds}):
-        for environment in {*config.tasks} & {*(section.environments or config.tasks)}:
-            logger.warning(
-                "cross_validation.seeds has %s, as the search on %s: the scores that candidates were chosen for count again",
-                ", ".join(map(str, own)),
-                environment,
-            )
+    if {*config.seeds} & {*section.seeds} and {*config.tasks} & {*(section.environments or config.tasks)}:
+        logger.warning("cross_validation.seeds has seeds of the search: scores that candidates were chosen for count again")
     losses = top_losses(study, section.top, section.top_rated) if top is None else top_losses(study, top)
     candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
     n_more = section.budget - len(section.seeds) if section.budget else 0

@@ -171,12 +171,9 @@ class Search:
         :param on_progress: Called about twice a second
         :raises RunFailed: after ten candidates that failed one after the other
         """
-        from sb3_aarl.search.results.dashboard import annotate_study, annotate_trial  # which take seconds to import
-
-        annotate_study(self.study)
         runs, retries = runs_of(self.config), self.config.retries
         returns = {environment: self.config.returns_on(environment) for environment in self.config.tasks}
-        driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, annotate_trial, returns)
+        driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, returns)
         with closing(iter(driver)) as progresses:
             for progress in progresses:
                 on_progress(progress)

@@ -59,7 +59,7 @@ def prepare_one(
         aux_loss=loss,
         hyperparameters=hyperparameters,
         seed=seed,
-        checkpoints=spread_checkpoints(environment_steps, n_evaluations, checkpoint_interval(hyperparameters)),
+        checkpoints=spread_checkpoints(environment_steps, n_evaluations, checkpoint_interval(hyperparameters, str(file))),
         evaluation_episodes=evaluation_episodes,
         threads=threads,
         keep_model=True,
@@ -70,8 +70,6 @@ def prepare_one(
         label = re.sub(r"[^a-z0-9]+", "-", f"{environment.removeprefix(PREFIX)} {named or 'none'}".lower())[:80].strip("-")
         folder = Path("runs") / f"{label}-{hashlib.sha256(run.model_dump_json().encode()).hexdigest()[:8]}-seed-{seed}"
     folder = Path(folder)
-    if (folder / "study.db").exists():  # sb3_aarl.search.execution.storage, which has the name, needs Optuna
-        raise ValueError(f"{folder} is the folder of a search: choose another folder (--folder)")
     check_run(run, str(file))
     prepare_run(folder, run)
     return folder

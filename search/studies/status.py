@@ -10,7 +10,6 @@ from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.execution import driver
-from sb3_aarl.search.execution.matrix import scaled
 from sb3_aarl.search.execution.queue import pace, seconds_to_go
 from sb3_aarl.search.execution.storage import has_driver
 from sb3_aarl.search.studies.search import stored_settings
@@ -18,10 +17,9 @@ from sb3_aarl.search.training.folder import RUN, is_running, partial_curve, read
 from sb3_aarl.search.training.provenance import read_about
 
 from sb3_aarl.aux_loss import AuxLoss
-from sb3_aarl.callbacks import aulc
 
 # Folders of matrices in that of a search.
-PARTS = ("baselines", "cross-validation", "operators")
+PARTS = ("baselines", "cross-validation")
 
 
 def search_status(study: optuna.Study, storage: BaseStorage, folder: Path) -> tuple[driver.SearchProgress, bool]:
@@ -43,27 +41,19 @@ def search_status(study: optuna.Study, storage: BaseStorage, folder: Path) -> tu
 
 def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     """
-    One row for each variant of a matrix, with the mean score of what is done, NaN where it is of several environments without
-    returns that count as 0 and 1; and the estimated seconds until all are over, None while that is not known.
+    The runs of each variant of a matrix: all, done, running, failed; and the estimated seconds until all are over, None while
+    that is not known.
     """
     rows = []
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
         outcome = read_outcome(path)
         curve = partial_curve(path) if outcome is None else outcome.curve
         left, seconds = pace(read_run(path), curve)
-        about = read_about(path)
-        row = {"variant": about["variant"], "task": path.parent.name, "done": 0, "running": 0, "failed": 0}
-        if outcome is None:
-            row |= {"running": is_running(path), "left": left}
-        elif outcome.failure is not None:
-            row["failed"] = 1
-        else:
-            row |= {"done": 1, "score": scaled(aulc(curve), about.get("returns")), "scaled": "returns" in about}
-        rows.append(row | {"seconds": seconds})
-    runs = pd.DataFrame(rows, columns=["variant", "task", "done", "running", "failed", "left", "score", "scaled", "seconds"])
+        failed = outcome is not None and outcome.failure is not None
+        states = outcome is not None and not failed, outcome is None and is_running(path), failed
+        rows.append((read_about(path)["variant"], *states, left if outcome is None else 0.0, seconds))
+    runs = pd.DataFrame(rows, columns=["variant", "done", "running", "failed", "left", "seconds"])
     by_variant = runs.groupby("variant", sort=False)
     table = by_variant[["done", "running", "failed"]].sum().astype(int)
     table.insert(0, "runs", by_variant.size())
-    is_comparable = (by_variant["task"].nunique() == 1) | (by_variant["scaled"].sum() == by_variant["score"].count())
-    table["score"] = by_variant["score"].mean().where(is_comparable)
     return table.reset_index(), seconds_to_go(list(runs["seconds"].dropna()), runs["left"].sum(), int(runs["running"].sum()))

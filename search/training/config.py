@@ -31,14 +31,10 @@ Model = TypeVar("Model", bound=BaseModel)
 
 def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     """
-    Read the hyper-parameters of an environment from a file like RL-Zoo's: a mapping from environment id to arguments of
-    SACAux, ``n_timesteps`` (agent steps), ``n_envs`` (environments that are trained on at once), ``env_kwargs`` (of
-    ``make_dmc_env``, or of ``wrap_env`` for what is not DeepMind Control), ``env_wrapper`` (as for :func:`env_wrappers`) and
-    ``normalize`` (true, or arguments of ``VecNormalize``). The environment's own entry is merged over the entry ``default``.
-
-    As in RL-Zoo, ``n_envs`` alone makes fewer updates; ``gradient_steps: -1`` keeps one for each transition. ``vec_env`` is
-    ``dummy`` (all in one process) or ``subproc`` (each in its own, faster where there are cores for them, and equal
-    otherwise). A learning rate may be ``lin_3e-4``, which falls to 0. Nothing in the file is evaluated.
+    Read the hyper-parameters of an environment from a file like RL-Zoo's: arguments of SACAux, ``n_timesteps`` (agent steps),
+    ``n_envs``, ``vec_env`` (``dummy`` or ``subproc``), ``env_kwargs`` (of ``make_dmc_env``, or of ``wrap_env`` for what is not
+    DeepMind Control), ``env_wrapper`` (see :func:`env_wrappers`) and ``normalize`` (true, or arguments of ``VecNormalize``).
+    The environment's own entry is merged over the entry ``default``. Nothing in the file is evaluated.
 
     :raises ConfigError: naming the file and the key that is wrong
     """
@@ -88,20 +84,18 @@ def action_repeat(hyperparameters: Mapping[str, Any]) -> int:
     return (hyperparameters.get("env_kwargs") or {}).get("action_repeat", 1)
 
 
-def checkpoint_interval(hyperparameters: Mapping[str, Any]) -> int:
+def checkpoint_interval(hyperparameters: Mapping[str, Any], source: str) -> int:
     """Environment steps of one rollout with these hyper-parameters: every checkpoint is a multiple of them."""
-    train_freq = hyperparameters.get("train_freq", 1)
-    rollout = train_freq if isinstance(train_freq, int) else 1 if train_freq[1] == "episode" else train_freq[0]
-    return max(1, rollout) * hyperparameters.get("n_envs", 1) * action_repeat(hyperparameters)
-
-
-def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, Any], source: str) -> None:
-    """Check that every checkpoint is the end of a rollout."""
     train_freq = hyperparameters.get("train_freq", 1)
     number, unit = (train_freq, "step") if isinstance(train_freq, int) else train_freq
     if number < 1 or (unit == "episode" and number > 1):
         raise ConfigError(f"{source}: train_freq must be a positive number of steps or 1 episode, not {train_freq}")
-    interval = checkpoint_interval(hyperparameters)
+    return number * hyperparameters.get("n_envs", 1) * action_repeat(hyperparameters)
+
+
+def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, Any], source: str) -> None:
+    """Check that every checkpoint is the end of a rollout."""
+    interval = checkpoint_interval(hyperparameters, source)
     if between := [steps for steps in sorted(checkpoints) if steps % interval]:
         rollout = f"{interval} (train_freq x n_envs x action repeat)"
         raise ConfigError(f"{source}: checkpoints must be multiples of {rollout}, {between} are not")
@@ -109,11 +103,10 @@ def check_checkpoints(checkpoints: Iterable[int], hyperparameters: Mapping[str, 
 
 def spread_checkpoints(environment_steps: int, n_evaluations: int, interval: int = 1) -> tuple[int, ...]:
     """Equally spaced checkpoints, multiples of an interval; the last is a little early where they do not divide the run."""
-    if n_evaluations < 1 or environment_steps < n_evaluations * interval:
-        raise ValueError(
-            f"{environment_steps} environment steps, {interval} at a time, are too few for {n_evaluations} evaluations"
-        )
     every = environment_steps // n_evaluations // interval * interval
+    if every == 0:
+        steps = f"{environment_steps} environment steps, {interval} at a time"
+        raise ValueError(f"{steps}, are too few for {n_evaluations} evaluations")
     return tuple(every * (i + 1) for i in range(n_evaluations))
 
 

@@ -27,12 +27,9 @@ class Run(pydantic.BaseModel, frozen=True, extra="forbid"):
     """
     One training run.
 
-    :param environment: Id of the environment
     :param aux_loss: Notation, name of the catalogue, or ``"auto"``; None for no auxiliary loss
     :param hyperparameters: As returned by ``load_hyperparameters``
-    :param seed: Seed of the run
     :param checkpoints: Environment steps of the evaluations, ascending; the run is resumed from there
-    :param evaluation_episodes: Episodes of each evaluation
     :param threads: Threads that PyTorch uses; they change the last bits
     :param imports: Modules that are imported first, such as those that register environments
     :param keep_model: Whether to leave the trained model as ``model.zip``

@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import hashlib
 import json
 import os
 import platform
@@ -27,22 +26,15 @@ PACKAGES = ("stable-baselines3", "torch", "gymnasium", "dm-control", "mujoco", "
 @functools.cache
 def commit() -> str:
     """
-    The commit of this checkout, with ``+changes.`` and a hash of them where files differ from it; the version where there is
-    no checkout. It is looked up once: a process keeps the code that it started with, whatever is checked out later.
+    The commit of this checkout, with ``-dirty`` where files differ from it; the version where there is no checkout. It is
+    looked up once: a process keeps the code that it started with, whatever is checked out later.
     """
     root = Path(__file__).parents[2]
-    if not (root / ".git").exists():  # installed, perhaps inside another checkout
-        return metadata.version("sb3-aarl")
-
-    def git(*arguments: str) -> bytes:
-        return subprocess.run(["git", *arguments], cwd=root, capture_output=True, check=True).stdout.strip()
-
-    try:
-        changes = git("diff", "--no-ext-diff", "HEAD")
-        digest = f"+changes.{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
-        return git("rev-parse", "--short=12", "HEAD").decode() + digest
-    except (OSError, subprocess.CalledProcessError):  # no git
-        return metadata.version("sb3-aarl")
+    if (root / ".git").exists():  # else installed, perhaps inside another checkout
+        command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):  # no git
+            return subprocess.run(command, cwd=root, capture_output=True, check=True, text=True).stdout.strip()
+    return metadata.version("sb3-aarl")
 
 
 def cpu() -> str:

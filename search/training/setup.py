@@ -135,12 +135,9 @@ def _with_schedules(value: Any) -> Any:
 
 def check_run(run: Run, source: str | None = None) -> Setup:
     """
-    Check that a run can be trained: create its environment and model, and train for some steps. Warn about settings that are
-    probably not intended.
+    Make a run's environment and model, and train for some steps. Warn about settings that are probably not intended.
 
-    :param run: The run
     :param source: The file with its settings, for messages
-    :return: Its environments and model
     :raises ConfigError: with the reason in one line, when it cannot be trained
     """
     what = f"{source or ''}: {run.environment} cannot be trained with these settings".removeprefix(": ")
@@ -202,12 +199,7 @@ def load_trained(
     env_kwargs = settings.get("env_kwargs") or {}
     if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
         env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}
-    try:
-        env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
-    except TypeError as error:  # Gymnasium's, for an environment that takes no render_mode
-        raise ValueError(f"{env_id} cannot be made: {error}") from error
-    if renders and "rgb_array" not in env.get_attr("metadata")[0].get("render_modes", ()):
-        raise ValueError(f"{env_id} has no pictures: its metadata's render_modes are without rgb_array")
+    env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
     if (folder / NORMALIZE).exists():
         env = VecNormalize.load(str(folder / NORMALIZE), env)
         env.training = env.norm_reward = False
