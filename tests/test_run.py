@@ -421,14 +421,6 @@ def test_evaluations_closer_than_an_episode(
     assert len(warnings) == n_warnings and all("truncate" in warning for warning in warnings)
 
 
-@pytest.mark.parametrize(("steps", "compiled"), [(7_990, False), (8_010, True)])
-def test_short_runs_are_not_compiled(steps: int, compiled: bool) -> None:
-    assert (
-        Setup(make_run(checkpoints=(steps,), hyperparameters=DENSE | {"compile": True}), "here").settings["compile"]
-        is compiled
-    )
-
-
 def test_a_run_too_short_to_learn_is_said_before_it_starts(caplog: pytest.LogCaptureFixture) -> None:
     check_run(make_run(hyperparameters=DENSE | {"learning_starts": 64}), "own.yml")
     check_run(make_run(hyperparameters=DENSE | {"learning_starts": 63}), "own.yml")

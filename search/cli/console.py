@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
 FOLDED = ("Loss", "variant", "notation")
-# Without a terminal: between two lines of progress in which nothing has changed.
-LINE_SECONDS = 600.0
 
 
 def say(text: object, style: str | None = None) -> None:
@@ -37,7 +34,7 @@ def say_json(data: Any) -> None:
 def live() -> Iterator[Callable[[str, object], None]]:
     """
     A function that shows progress, on stderr: in place on a terminal; elsewhere, as in a job's log, as one more line with the
-    time where the state has changed, and every ten minutes.
+    time where the state has changed.
     """
     if errors.is_terminal:
         with Live(console=errors, refresh_per_second=2) as display:
@@ -45,12 +42,11 @@ def live() -> Iterator[Callable[[str, object], None]]:
             yield lambda line, state: display.update(line.replace("; ", "\n"))
         return
     last_state: object = None
-    last_time = -LINE_SECONDS
 
     def show(line: str, state: object) -> None:
-        nonlocal last_state, last_time
-        if state != last_state or time.monotonic() - last_time > LINE_SECONDS:
-            last_state, last_time = state, time.monotonic()
+        nonlocal last_state
+        if state != last_state:
+            last_state = state
             errors.print(f"{datetime.now():%H:%M:%S} {line}", markup=False, highlight=False)
 
     yield show

@@ -44,9 +44,9 @@ def next_runs(scores: np.ndarray, budget: int, start: int = 2) -> list[tuple[int
     """
     The runs to train next: losses and seeds, as rows and columns of the scores.
 
-    A race goes in rounds. In the first one each loss gets ``start`` seeds; in each later one those that could still be the
-    best, at least two, get their next seed. All is read from the scores, round by round: a race that is interrupted is
-    resumed, and no order in which runs finish changes it. Call it again whenever a run has finished, until it returns no runs.
+    In the first round each loss gets ``start`` seeds; in each later one those that could still be the best, at least two, get
+    their next seed. All is read from the scores: no order in which runs finish changes it. Call it again whenever a run has
+    finished, until it returns no runs.
 
     :param scores: Scores so far, NaN where there is none yet; each loss has at most as many seeds as there are columns
     :param budget: Number of runs of the whole race

@@ -38,11 +38,8 @@ def distributions(
     horizon: int, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None
 ) -> dict[str, BaseDistribution]:
     """
-    Optuna's parameters of a loss: ``horizon``, one boolean a token (``source/s_t+1``), ``operator`` and ``negatives``.
-
-    :param horizon: Horizon of the loss, which decides what tokens there are
-    :param max_horizon: Longest horizon of the space
-    :param operators: Operators that are searched too, None for mean squared error without negatives (paper, 2.2)
+    Optuna's parameters of a loss: ``horizon``, one boolean for each token that it has (``source/s_t+1``), ``operator`` and
+    ``negatives``; without ``operators``, mean squared error without negatives (paper, 2.2).
     """
     space: dict[str, BaseDistribution] = {"horizon": IntDistribution(1, max_horizon)}
     source, target = token_names(horizon)
@@ -98,12 +95,10 @@ def loss_of(trial: FrozenTrial) -> AuxLoss | None:
 def suggest_aux_loss(trial: BaseTrial, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
     """
     Suggest the parameters of a loss, with any sampler of Optuna. A trial that has them already, such as ``study.best_trial``,
-    returns its loss.
+    returns its loss. AuxLossSampler has its own space.
 
-    :param trial: The trial
-    :param max_horizon: Longest horizon of the space; AuxLossSampler has its own
-    :param operators: Operators to search too, with and without negatives; None for mean squared error without. AuxLossSampler
-        has its own
+    :param max_horizon: Longest horizon of the space
+    :param operators: Operators to search too, with and without negatives; None for mean squared error without
     :raises optuna.TrialPruned: when what the sampler proposes, or a user enqueued, is not valid; nothing was trained then
     """
     check_operators(operators)

@@ -72,10 +72,8 @@ def is_temporary(error: BaseException) -> bool:
 @contextmanager
 def driver_lock(storage: BaseStorage, study_name: str, folder: Path) -> Iterator[None]:
     """
-    Hold the locks of a search: that of its folder, and that of its study, which drivers with other folders may share. The
-    latter is a file beside a database of SQLite, and the database's own in PostgreSQL, as long as the server runs.
-
-    :raises ValueError: when another program holds one of them
+    Hold the locks of a search: that of its folder, and that of its study, which is a file beside a database of SQLite, and the
+    database's own in PostgreSQL. A ValueError where another program holds one of them.
     """
     study_id, files = storage.get_study_id_from_name(study_name), [folder / LOCK]
     engine = storage.engine if isinstance(storage, RDBStorage) else None

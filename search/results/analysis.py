@@ -81,9 +81,8 @@ def has_pattern(loss: AuxLoss, pattern: AuxLoss) -> bool:
     The paper's rule (section 3.3): a candidate has a pattern if the pattern's source is a subset of the candidate's source,
     and the pattern's target is a subset of the candidate's target.
 
-    The sets are those of tokens, offsets included, and nothing is shifted in time: ``{s_t+1, a_t+1} -> {s_t+2}`` does not
-    have the pattern ``{s_t, a_t} -> {s_t+1}`` though its canonical form does. Neither operator matters. To compare the
-    canonical forms instead, pass ``table.assign(loss=table["canonical"])`` to the functions below.
+    Nothing is shifted in time: ``{s_t+1, a_t+1} -> {s_t+2}`` does not have the pattern ``{s_t, a_t} -> {s_t+1}``, though its
+    canonical form does. Operators do not matter.
     """
     sides = ((pattern.source_tokens, loss.source_tokens), (pattern.target_tokens, loss.target_tokens))
     return all(set(few) <= set(many) for few, many in sides)
@@ -114,9 +113,8 @@ def table5(table: pd.DataFrame, patterns: Mapping[str, str | AuxLoss] = PATTERNS
     """
     Whether losses with a pattern have other scores than those without it (paper, section 3.3, table 5).
 
-    All analysed trials of all generations are one sample, as in the paper. They are not independent: candidates descend from
-    each other, and later generations score higher and have other patterns. So p-values are lower than those of an
-    experiment, and they are not corrected for the number of tests.
+    All analysed trials are one sample, as in the paper. They descend from each other, and p-values are not corrected for the
+    number of tests: they are too low.
     """
     rows = {name: _compare(*scores) for name, scores in pattern_scores(table, patterns).items()}
     result = pd.DataFrame.from_dict(rows, orient="index")
@@ -141,9 +139,7 @@ def _compare(scores_with: pd.Series, scores_without: pd.Series) -> dict[str, flo
 
 
 def effects(table: pd.DataFrame, by: str | Sequence[str]) -> pd.DataFrame:
-    """
-    Scores of the analysed trials of each group, such as ``by="horizon"``, and their differences from all others.
-    """
+    """Scores of the analysed trials of each group, such as ``by="horizon"``, and their differences from all others."""
     trials = analysed(table)
     groups = trials.groupby(by if isinstance(by, str) else list(by))["score"]
     result = groups.agg(n="size", mean="mean", std="std", median="median")

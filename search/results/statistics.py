@@ -24,9 +24,8 @@ def interquartile_means(runs: pd.DataFrame) -> pd.DataFrame:
     Interquartile mean (IQM) of the returns with a 95 % interval by stratified bootstrap (Agarwal et al. 2021, rliable):
     percentiles over resamples of the seeds within each task.
 
-    The IQM is over returns as they are, so only over tasks of one scale: those of DeepMind Control (0 to 1000) together,
-    each other environment by itself. Only tasks count that all variants of the checkpoint have runs on, and of each variant
-    the seeds that it has on all of them, so that every task weighs the same; variants without any run are left out.
+    It is over tasks of one scale: those of DeepMind Control together, each other environment by itself. Tasks count that all
+    variants have runs on, and of each variant the seeds that it has on all of them.
     """
     rows = []
     scales = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")

@@ -241,12 +241,7 @@ def stored_settings(study: optuna.Study) -> dict[str, Any]:
 
 
 def check_study(study: optuna.Study, config: SearchConfig, free: Sequence[str] = ()) -> None:
-    """
-    Compare the settings of a study with those of a file.
-
-    :param free: Settings that may differ
-    :raises ValueError: naming the first setting that differs
-    """
+    """Raise a ValueError that names the first setting in which a study differs from a file."""
     stored, problem = study.user_attrs.get(SETTINGS_KEY), None
     if study.directions != [StudyDirection.MAXIMIZE]:
         problem = f"its directions are {[direction.name.lower() for direction in study.directions]}, not one to maximize"

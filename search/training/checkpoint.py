@@ -111,9 +111,8 @@ def remove(folder: Path) -> None:
 
 class CheckpointCallback(BaseCallback):
     """
-    After each evaluation, save the run when the rollout that was evaluated is stored and trained on, call ``on_save``, and
-    restart it. When the file ``stop`` exists, training ends at once: what follows the last evaluation is lost, and the
-    checkpoint stays. ``state`` is the checkpoint from which the run is resumed.
+    Save the run after each evaluation, call ``on_save``, and restart it. When the file ``stop`` exists, training ends at once,
+    and the checkpoint stays. ``state`` is the checkpoint from which the run is resumed.
     """
 
     model: SACAux

@@ -52,13 +52,11 @@ def train(
     on_evaluation: Callable[[list[Evaluation]], object] | None = None,
 ) -> list[Evaluation]:
     """
-    Train the run of a folder in this process, from its last checkpoint on. On a CPU, a run that was killed and resumed ends
-    bit for bit like an undisturbed one if ``reset(seed)`` determines all that its environment does.
+    Train the run of a folder, after :func:`prepare_run`, in this process, from its last checkpoint on; that of a finished run
+    is read. On a CPU, a run that was killed and resumed ends bit for bit like an undisturbed one if ``reset(seed)`` determines
+    all that its environment does. A file ``stop`` in the folder ends the run at once; its last checkpoint stays.
 
-    :param folder: Folder that :func:`prepare_run` has prepared
-    :param on_evaluation: Called with the curve so far after each evaluation. A file ``stop`` in the folder ends the run at
-        once; its last checkpoint stays
-    :return: The learning curve; that of a finished run is read, not trained again
+    :param on_evaluation: Called with the curve so far after each evaluation
     :raises filelock.Timeout: when another process trains it for longer than a minute
     """
     folder = Path(folder)

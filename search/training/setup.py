@@ -38,9 +38,6 @@ logger = logging.getLogger(__name__)
 
 # Evaluations are normalized with the statistics of training, and have the task's own rewards.
 FIXED = {"training": False, "norm_reward": False}
-# Agent steps of the shortest run that is compiled: it takes two minutes, and saves at most 15 ms of a gradient step, from
-# pixels (benchmarks/README.md).
-COMPILED_STEPS = 8_000
 VIDEO_SIZE = 320  # pixels of a film, height and width
 # Agent steps of a run that is tried out: so that there are windows.
 TRIED_STEPS = 20
@@ -89,8 +86,6 @@ class Setup:
         default = inspect.signature(SACAux).parameters["buffer_size"].default
         needed = math.ceil(self.agent_steps / self.n_envs) * self.n_envs
         settings["buffer_size"] = min(settings.get("buffer_size", default), needed)
-        if settings.get("compile") and self.agent_steps < COMPILED_STEPS:
-            settings["compile"] = False
         self.settings = _with_schedules(settings) | {"aux_loss": run.aux_loss, "seed": run.seed}
 
         is_dmc = run.environment.startswith(PREFIX)
