@@ -36,10 +36,7 @@ class _CropsImages:
     features_extractor: Any
     observation_space: spaces.Space
     normalize_images: bool
-
-    @cached_property
-    def image_keys(self) -> frozenset[str]:
-        return frozenset(image_spaces(self.observation_space, not self.normalize_images))
+    image_keys: frozenset[str]
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         return features_extractor(self.preprocess(obs))
@@ -142,6 +139,7 @@ class Actor(_CropsImages, SB3Actor):
         **kwargs: Any,
     ):
         super().__init__(*args, **kwargs)
+        self.image_keys = frozenset(image_spaces(self.observation_space, not self.normalize_images))
         self.crop_size = crop_size
         self.squash_log_std = squash_log_std
 
@@ -189,6 +187,7 @@ class Critic(_CropsImages, ContinuousCritic):
 
     def __init__(self, *args: Any, crop_size: int | None = None, norm: str | None = None, **kwargs: Any):
         super().__init__(*args, **kwargs)
+        self.image_keys = frozenset(image_spaces(self.observation_space, not self.normalize_images))
         self.crop_size = crop_size
         self.norm = norm
         if norm is not None:

@@ -32,7 +32,7 @@ from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAux
 
 logger = logging.getLogger(__name__)
 
-COMPILED = ("_act", "_target_q", "_critic_loss", "_aux_loss")
+COMPILED = ("_act", "_target_q", "_critic_loss", "_joint_critic_loss", "_aux_loss")
 
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
 
