@@ -8,8 +8,9 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# Headless rendering for the tests from pixels, and the database.
+# Headless rendering for the tests from pixels; the browser for the test of optuna-dashboard; the database.
 RENDERING := libegl1 libosmesa6 libgl1-mesa-dri
+BROWSER := chromium chromium-driver
 DATABASE := postgresql
 DEMO := dmc,search
 
@@ -61,7 +62,7 @@ $(VENV)/.installed-dev: setup.cfg constraints.txt
 
 # Installs what is missing if that is possible without asking; else one line says what to do.
 system:
-	@missing=; for package in $(RENDERING) $(DATABASE); do \
+	@missing=; for package in $(RENDERING) $(BROWSER) $(DATABASE); do \
 		dpkg -s $$package >/dev/null 2>&1 || missing="$$missing $$package"; \
 	done; \
 	if [ -n "$$missing" ]; then \

@@ -55,6 +55,11 @@ class Own(gym.Env):
         return self.np_random.integers(0, 256, (32, 32, 3), np.uint8)
 
 
+class Unseen(Own):
+    def __init__(self):
+        pass
+
+
 class Image(Own):
     observation_space = gym.spaces.Box(0, 255, (16, 16, 3), np.uint8)
 
@@ -70,6 +75,8 @@ class Parts(Image):
 
 
 gym.register("Shown-v0", Own, max_episode_steps=20)
+gym.register("Unseen-v0", Unseen, max_episode_steps=20)
+gym.register("Blind-v0", type("Blind", (Own,), {"metadata": {}}), max_episode_steps=20)
 gym.register("Image-v0", Image, max_episode_steps=20)
 gym.register("Parts-v0", Parts, max_episode_steps=20)
 """
@@ -273,6 +280,8 @@ def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
     (trained / "model.zip").rename("alone.zip")
     assert "which environment?" in run("evaluate", "alone.zip", code=2)
     assert "spaces do not match" in run("evaluate", "alone.zip", "Pendulum-v1", code=2)
+    assert "Unseen-v0 cannot be made" in run("video", "alone.zip", "Unseen-v0", code=2)
+    assert "Blind-v0 has no pictures" in run("video", "alone.zip", "Blind-v0", code=2)
     assert "no_env cannot be imported" in run("evaluate", "alone.zip", "Shown-v0", "--imports", "no_env", code=2)
     assert "model.zip does not exist" in run("video", trained, code=2)
 

@@ -1,4 +1,4 @@
-"""The report of a study, parsed."""
+"""The report of a study: parsed, and opened in a real browser."""
 
 from collections import Counter
 from datetime import datetime, timedelta
@@ -7,6 +7,7 @@ import lxml.html
 import numpy as np
 import optuna
 import pytest
+from browser import open_browser, requested
 from optuna.distributions import FloatDistribution
 from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, TrialState
@@ -16,6 +17,7 @@ from sb3_aarl.search.results import analysis
 from sb3_aarl.search.results.report import generation_table, stored_baselines, write_report
 from sb3_aarl.search.training.provenance import write_about
 from sb3_aarl.search.training.run import Run, prepare_run
+from selenium.webdriver.common.by import By
 
 from sb3_aarl.callbacks import Evaluation, write_curve
 
@@ -237,3 +239,27 @@ def test_report_of_another_sampler(tmp_path):
     write_report(study, tmp_path / "report.html")
     rows = table_after(read_page(tmp_path / "report.html"), "Best losses")
     assert rows == [["no loss", "1", "1.00", "1", "-", "–"], ["no loss", "0", "2.00", "1", "-", "–"]]
+
+
+@pytest.mark.slow
+def test_in_a_real_browser(study, path, tmp_path):
+    best = completed(study)
+    with open_browser(tmp_path / "profile") as browser:
+        browser.get(path.as_uri())
+        assert browser.title.startswith("study <script>")
+        # Table 5 is shown as it is, and the pictures are drawn, none wider than the text.
+        patterns = browser.find_element(By.XPATH, "//h2[.='Patterns']/following-sibling::div[1]")
+        assert "Action, n_target > n_source" in patterns.text and patterns.is_displayed()
+        pictures = browser.find_elements(By.CSS_SELECTOR, "figure img")
+        assert len(pictures) == 1 and all(picture.get_attribute("alt") for picture in pictures)
+        for picture in pictures:
+            assert int(picture.get_attribute("naturalWidth")) > 300
+            assert 500 < picture.rect["width"] <= patterns.rect["width"] + 1 and picture.rect["height"] > 200
+        assert [trial.number for trial in best[:10]] == [
+            int(row.find_elements(By.TAG_NAME, "td")[1].text)
+            for row in browser.find_elements(By.XPATH, "//h2[.='Best losses']/following::table[1]/tbody/tr")
+        ]
+        width = browser.execute_script("return [document.documentElement.scrollWidth, window.innerWidth]")
+        assert width[0] <= width[1]  # nothing runs out of the page
+        assert requested(browser) == [path.as_uri()]
+        assert browser.get_log("browser") == []

@@ -1,5 +1,6 @@
-"""Commands that show what is stored and train nothing: table, status, report."""
+"""Commands that show what is stored and train nothing: table, status, report, dashboard."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -92,3 +93,23 @@ def report(
     patterns = {**PATTERNS, **{text: text for text in pattern or ()}}
     write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"), patterns)
     say(f"Report: {out}")
+
+
+@app.command(rich_help_panel="A search")
+def dashboard(
+    search: options.SearchFolder = None,
+    storage: Storage = None,
+    folder: Folder = None,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; the default is reached from this machine only.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
+) -> None:
+    """Watch a search in optuna-dashboard. Everybody who reaches it can change and delete studies."""
+    from optuna_dashboard import run_server
+    from sb3_aarl.search.execution.storage import open_storage
+
+    opened = open_storage(search_folder(folder or search, storage), storage, create=False)
+    say(f"http://{host}:{port}/  (Ctrl-C to stop; --port for another port)")
+    with suppress(KeyboardInterrupt):
+        run_server(opened, host=host, port=port)

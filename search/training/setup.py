@@ -194,7 +194,12 @@ def load_trained(
     env_kwargs = settings.get("env_kwargs") or {}
     if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
         env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}
-    env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
+    try:
+        env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
+    except TypeError as error:  # Gymnasium's, for an environment that takes no render_mode
+        raise ValueError(f"{env_id} cannot be made: {error}") from error
+    if renders and "rgb_array" not in env.get_attr("metadata")[0].get("render_modes", ()):
+        raise ValueError(f"{env_id} has no pictures: its metadata's render_modes are without rgb_array")
     if (folder / NORMALIZE).exists():
         env = VecNormalize.load(str(folder / NORMALIZE), env)
         env.training = env.norm_reward = False
