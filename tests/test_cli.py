@@ -201,7 +201,7 @@ def test_search_reports_progress_and_resumes(folder: Path, executor: Planted) ->
     output = run("search", "small.yml", "--generations", 1, "--threads", 2, "--workers", 3)
     assert executor.arguments == (3,) and {run.threads for run in executor.runs} == {2}
     assert "generation 1: 2/2 done, 0 running, 0 failed; best 1.00, finished" in output
-    assert "optuna-dashboard sqlite:///runs/small/study.db" in output and "score 1.00" in output
+    assert "To watch it: aarl dashboard runs/small\n" in output and "score 1.00" in output
     output = run("search", "small.yml", "--threads", 2)
     assert "generation 1: 2/2 done" in output and "generation 2: 2/2 done" in output and len(executor.runs) == 4
     study = optuna.load_study(study_name="small", storage=open_storage(Path("runs/small")))
