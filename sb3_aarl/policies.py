@@ -32,11 +32,14 @@ from sb3_aarl.networks import orthogonal_init, q_network
 class _CropsImages:
     """Mixin for SB3 models: images that are larger than ``crop_size`` are cropped to their centre before the encoder."""
 
-    crop_size: int | None
     features_extractor: Any
     observation_space: spaces.Space
     normalize_images: bool
-    image_keys: frozenset[str]
+
+    def __init__(self, *args: Any, crop_size: int | None = None, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.image_keys = frozenset(image_spaces(self.observation_space, not self.normalize_images))
+        self.crop_size = crop_size
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         return features_extractor(self.preprocess(obs))
@@ -138,9 +141,7 @@ class Actor(_CropsImages, SB3Actor):
         squash_log_std: tuple[float, float] | None = None,
         **kwargs: Any,
     ):
-        super().__init__(*args, **kwargs)
-        self.image_keys = frozenset(image_spaces(self.observation_space, not self.normalize_images))
-        self.crop_size = crop_size
+        super().__init__(*args, crop_size=crop_size, **kwargs)
         self.squash_log_std = squash_log_std
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -186,9 +187,7 @@ class Critic(_CropsImages, ContinuousCritic):
     """
 
     def __init__(self, *args: Any, crop_size: int | None = None, norm: str | None = None, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.image_keys = frozenset(image_spaces(self.observation_space, not self.normalize_images))
-        self.crop_size = crop_size
+        super().__init__(*args, crop_size=crop_size, **kwargs)
         self.norm = norm
         if norm is not None:
             inputs = kwargs["features_dim"] + get_action_dim(self.action_space)

@@ -626,12 +626,10 @@ class SACAux(SAC):
             logger.warning("the parameters are of a model with %s", problem)
             given = {name: value for name, value in given.items() if name not in auxiliary}
             given |= {name: own[name] for name in auxiliary & own.keys()}
-        sizes = [
-            len(some["critic.optimizer"]["param_groups"][0]["params"]) for some in (own, given) if "critic.optimizer" in some
-        ]
-        if len(set(sizes)) > 1:
+        key = "critic.optimizer"
+        if key in given and len(given[key]["param_groups"][0]["params"]) != len(own[key]["param_groups"][0]["params"]):
             # With aux_kwargs=dict(joint=True) the auxiliary optimizer has the encoder's part of the state.
-            given["critic.optimizer"] = own["critic.optimizer"]
+            given[key] = own[key]
         super().set_parameters(given, exact_match, device)
 
     def __getstate__(self) -> dict[str, Any]:

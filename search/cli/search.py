@@ -69,7 +69,6 @@ def search(
             say(f"This counts all that the file says, also what is done: aarl status {path}")
         return
     options = "" if storage is None else f" --storage {hide_password(storage)}"
-    options = "" if storage is None else f" --storage {hide_password(storage)}"
     say(f"Study {found.study.study_name}. To watch it: aarl dashboard {path}{options}")
     running: Any
     cpus, gpus = cpus_per_run or 1, gpus_per_run or 0

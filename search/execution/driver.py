@@ -150,8 +150,8 @@ class Driver:
             logger.warning("Trial %d: %s", trial.number, problem)
             self._tell(trial, state=TrialState.PRUNED)
             return
-        of_run = {"loss": runs[0].aux_loss, "threads": runs[0].threads}
-        self._note(trial, {**of_run, "commit": commit(), "versions": versions()})
+        about = {"loss": runs[0].aux_loss, "threads": runs[0].threads, "commit": commit(), "versions": versions()}
+        self._note(trial, about)
         tasks = [list(task) for _, task in groupby(runs, lambda run: run.environment)]
         self.running[trial.number] = RunningTrial(trial, tasks)
         self._submit(self.running[trial.number])
