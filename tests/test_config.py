@@ -331,6 +331,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"overrides": {"env_wrapper": [{"gymnasium.wrappers.TimeLimit": 3}]}}, "env_wrapper: must name .*TimeLimit': 3}"),
     ({"overrides": {"replay_buffer_class": "HerReplayBuffer"}}, "replay_buffer_class: cannot be set in a file"),
     ({"overrides": {"callback": "rl_zoo3.callbacks.ParallelTrainCallback"}}, "callback: unknown key"),
+    ({"overrides": {"train_freq": 0}}, "train_freq must be a positive number of steps"),
     ({"overrides": {"n_envs": 1.5}}, "n_envs: should be a valid integer"),
     ({"overrides": {"vec_env": "threads"}}, "vec_env: should be 'dummy' or 'subproc', not 'threads'"),
 ]

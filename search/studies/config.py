@@ -22,7 +22,7 @@ from pydantic import (
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import MAX_HORIZON, loss_to_params
 from sb3_aarl.search.training import config as training
-from sb3_aarl.search.training.config import ConfigError
+from sb3_aarl.search.training.config import ConfigError, check_checkpoints
 from sb3_aarl.search.training.shipped import find_file
 
 from sb3_aarl import catalog
@@ -293,6 +293,8 @@ def load_config(path: str | Path, **changes: Any) -> SearchConfig:
     section = config.cross_validation
     validated = (section.environments or tuple(config.tasks)) if section else ()
     for env_id in dict.fromkeys([*config.tasks, *validated]):
+        if env_id in config.tasks:
+            check_checkpoints(config.checkpoints_on(env_id), config.hyperparameters_for(env_id), f"{path}: {env_id}")
         for baseline in (None, *config.baselines):
             config.hyperparameters_for(env_id, baseline)
         if config.environments and config.returns_on(env_id) is None:
