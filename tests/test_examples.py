@@ -1,5 +1,6 @@
-"""The scripts in examples/ run as they are, with fewer steps."""
+"""The scripts and the notebook in examples/ run as they are, with fewer steps."""
 
+import json
 import runpy
 import sys
 from pathlib import Path
@@ -30,3 +31,16 @@ def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
     monkeypatch.setattr(sys, "argv", [f"{name}.py", "--steps", "230"])
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     assert capsys.readouterr().out.splitlines()[-1].startswith(LAST[name])
+
+
+@pytest.mark.slow
+def test_notebook(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The code cells, one after the other; the notebook has the outputs of a whole run in it."""
+    monkeypatch.setenv("STEPS", "200")
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    cells = json.loads((EXAMPLES / "from_sac_to_sac_aux.ipynb").read_text(encoding="utf-8"))["cells"]
+    names: dict[str, object] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert "(1000, 17) -> (1000, 81)" in capsys.readouterr().out
