@@ -17,8 +17,6 @@ from typing import Any
 import pandas as pd
 import paper_tables
 import yaml
-from rich.table import Table
-from rich.text import Text
 from sb3_aarl.search.execution.matrix import stored_scores, task_name
 from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
 from sb3_aarl.search.results import analysis, table
@@ -40,7 +38,6 @@ DRAWN, BEST = 20, 10
 # The tables of an analysis, and their titles.
 ANALYSES = {
     "table5": "Patterns: mean score with - without (table 5; Welch's t-test: * p < 0.05, ** p < 0.01)",
-    "importances": "Importances of the tokens (mean decrease of impurity), the highest",
     "horizon": "Scores by horizon; difference to all others",
     "operator": "Scores by operator; difference to all others",
     "operation": "Scores by operation; difference to all others",
@@ -112,8 +109,8 @@ def page(folder: Path, parts: Iterable[str]) -> str:
 def benchmark_tables(folder: Path) -> Iterator[str]:
     """What ``aarl table`` shows of a benchmark, and its runs."""
     found = table.read_tables(folder)
-    for shown in table.terminal_tables(found):
-        yield f"## {shown.title}\n\n{from_terminal(shown)}"
+    for title, shown in table.text_tables(found).items():
+        yield f"## {title}\n\n{from_frame(shown)}"
     yield "\n\n".join([*table.footnotes(found), *table.missing(found.runs), *table.mixed(found.runs)])
     if (number := paper_tables.closest_table(found.runs["variant"])) is not None:
         mark = "▲ ▼: the difference is more than two standard errors, 2 sqrt(s²/n + S²/N)."
@@ -159,8 +156,7 @@ def search_tables(folder: Path) -> Iterator[str]:
     found = analysis.summary(study.get_trials(deepcopy=False))
     for name, title in ANALYSES.items():
         if name in found:
-            frame = found[name].head(20) if name == "importances" else found[name]
-            yield f"## {title}\n\n{from_frame(analysis.readable(frame))}"
+            yield f"## {title}\n\n{from_frame(analysis.readable(found[name]))}"
     for part in parts[1:]:
         if not (runs := stored_scores(folder / part)).empty:
             ranked = mean_scores(runs)
@@ -217,13 +213,6 @@ def core_hours(folder: Path, parts: Iterable[str]) -> str:
         hours = [about["seconds"] * about["sessions"][-1]["threads"] / 3600 for about in abouts if "seconds" in about]
         rows.append((part, len(hours), f"{math.fsum(hours):.1f}"))
     return "## Cost\n\n" + markdown([("part", "runs", "core hours"), *rows])
-
-
-def from_terminal(shown: Table) -> str:
-    """A table of ``aarl`` as Markdown."""
-    heads = [str(column.header).replace("\n", "<br>") for column in shown.columns]
-    cells = zip(*(column.cells for column in shown.columns), strict=True)
-    return markdown([[Text.from_markup(str(cell)).plain for cell in row] for row in [heads, *cells]])
 
 
 def from_frame(frame: pd.DataFrame) -> str:

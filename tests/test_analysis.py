@@ -149,7 +149,6 @@ def test_small_studies_give_counts_and_no_p_values():
     assert analysis.table5(empty)["n_with"].sum() == 0
     assert analysis.effects(empty, "horizon").empty and analysis.lineage(empty).empty
     assert analysis.lineage(analysis.trial_table([make_trial(None, state=TrialState.FAIL)])).empty
-    assert "importances" not in analysis.summary([])
 
 
 def test_effects_are_those_of_groups_against_the_rest():
@@ -174,41 +173,6 @@ def test_effects_are_those_of_groups_against_the_rest():
     # Studies side by side keep their trials apart even though the numbers repeat.
     twice = analysis.effects(pd.concat([table.assign(task="a"), table.assign(task="b")], ignore_index=True), "task")
     assert twice["n"].tolist() == [200, 200] and twice["difference"].abs().max() < 1e-9
-
-
-def test_importances_find_what_was_planted():
-    """Also for a token that short losses do not have."""
-    rng = np.random.default_rng(3)
-    drawn = [random_loss(rng, 3, ("mse", "bilinear")) for _ in range(200)]
-
-    def score(loss):
-        late = len(loss.source) > 6 and loss.source[6]
-        return 30 * late - 12 * loss.target[0] + rng.normal(0, 2)
-
-    values = [score(loss) for loss in drawn]
-    trials = [make_trial(loss, value, operators=("mse", "bilinear")) for loss, value in zip(drawn, values, strict=True)]
-    pruned = make_trial(drawn[0], 1e9, state=TrialState.PRUNED, operators=("mse", "bilinear"))
-    result = analysis.importances(analysis.trial_table(in_study([*trials, pruned])))
-    names = {f"{side}/{kind}_t{f'+{i}' if i else ''}" for side in ("source", "target") for kind in "sar" for i in range(3)}
-    assert set(result.index) == names | {"source/s_t+3", "target/s_t+3", "horizon", "operator", "negatives"}
-    assert result["importance"].sum() == pytest.approx(1) and result["importance"].is_monotonic_decreasing
-    # The horizon is bound up with the late token.
-    assert result.index.drop("horizon")[0] == "source/s_t+2"
-    chosen = np.array([loss.horizon > 1 and loss.source[6] for loss in drawn])
-    row = result.loc["source/s_t+2"]
-    assert (row["n_with"], row["n_without"]) == (chosen.sum(), (~chosen).sum())
-    assert row["difference"] == pytest.approx(np.mean(np.array(values)[chosen]) - np.mean(np.array(values)[~chosen]))
-    assert result.loc["horizon", ["difference", "n_with"]].isna().all()
-
-
-def test_importances_are_repeatable_and_need_scores_that_differ():
-    rng = np.random.default_rng(4)
-    drawn = [random_loss(rng, 1) for _ in range(40)]
-    table = analysis.trial_table(in_study([make_trial(loss, float(loss.target[3])) for loss in drawn]))
-    first, second = analysis.importances(table), analysis.importances(table)
-    pd.testing.assert_frame_equal(first, second)
-    assert first.index[0] == "target/s_t+1" and not {"operator", "negatives"} & set(first.index)
-    assert analysis.importances(table.assign(score=1.0)) is None
 
 
 def test_an_evolution_of_the_sampler():

@@ -266,7 +266,6 @@ def test_cross_validation_ranks_what_is_complete(searched: optuna.Study, executo
     # The same command trains what is missing.
     n_runs, executor.fails = len(executor.runs), lambda run: False
     assert f"Winner: {best}" in run("cross-validate", "small.yml") and len(executor.runs) == n_runs + 1
-    assert f"Winner: {best}" in run("cross-validate", "small.yml", "--top", 1) and len(executor.runs) == n_runs + 1
 
 
 def test_a_cross_validation_with_baselines(searched: optuna.Study, executor: Planted) -> None:

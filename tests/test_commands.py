@@ -21,7 +21,7 @@ from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.studies.config import load_config
 from sb3_aarl.search.studies.cost import measure
 from sb3_aarl.search.training.run import prepare_run, train
-from sb3_aarl.search.training.shipped import ZOO, find_file, shipped_files
+from sb3_aarl.search.training.shipped import ZOO, find_file
 from tiny import HYPERPARAMETERS, SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
 
@@ -138,12 +138,6 @@ def test_a_search_may_name_a_shipped_file_or_none(folder: Path) -> None:
     assert config.hyperparameters == ZOO / "paper/sac_identity.yml"
     text = SEARCH.replace("hyperparameters: hyperparameters.yml\n", "overrides: {batch_size: 8}\n")
     assert load_config(write_search(folder, text)).hyperparameters_for("Pendulum-v1") == {"batch_size": 8}
-
-
-def test_configs_lists_all_files_with_their_first_line() -> None:
-    shown = run("configs")
-    for name in [*shipped_files(True), *shipped_files(False)]:
-        assert re.search(rf"│ {re.escape(name)} +│ +\w", shown)
 
 
 @pytest.mark.slow

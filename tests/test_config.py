@@ -152,7 +152,7 @@ def test_every_part_of_a_search_is_read(tmp_path: Path) -> None:
     )
     assert config.baselines[0] == Baseline(name="a", aux_loss=REWARD)
     assert [baseline.aux_loss for baseline in config.baselines[1:]] == [None, None]
-    assert config.operators == ("mse", "inner")
+    assert config.operators == ["mse", "inner"]
     assert config.hyperparameters_for("Pendulum-v1", config.baselines[1]) == {
         "env_kwargs": {"action_repeat": 4},
         "batch_size": 64,

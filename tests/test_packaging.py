@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 # Modules of the extras. The import system takes None for one that is not there.
 BARE = """
 import sys
-extras = "dm_control dm_env imageio matplotlib mujoco optuna packaging pandas scipy shimmy sklearn"
+extras = "dm_control dm_env imageio matplotlib mujoco optuna packaging pandas scipy shimmy"
 sys.modules.update(dict.fromkeys(extras.split()))
 """
 WITHOUT_EXTRAS = """

@@ -16,8 +16,7 @@ from sb3_aarl.search.execution.matrix import stored_scores
 from sb3_aarl.search.execution.storage import load_study, open_storage
 from sb3_aarl.search.results.analysis import analysed, trial_table
 from sb3_aarl.search.results.report import stored_baselines
-from sb3_aarl.search.results.statistics import interquartile_means
-from sb3_aarl.search.results.table import read_runs
+from sb3_aarl.search.results.table import interquartile_means, read_runs
 from sb3_aarl.search.studies import benchmark
 from sb3_aarl.search.studies.benchmark import load_benchmark, read_experiment
 from scipy.stats import mannwhitneyu

@@ -245,7 +245,7 @@ def test_cross_validation_of_the_best(config: SearchConfig, tmp_path: Path, capl
     assert {run.checkpoints for run in matrix.runs.values() if run.environment == "Pendulum-v1"} == {(800,)}
     same = config.cross_validation.model_copy(update={"seeds": (0, 2)})
     more = {"cross_validation": same, "threads": 2, "generations": 3}
-    cross_validation.make_matrix(config.model_copy(update=more), study, tmp_path, top=1)
+    cross_validation.make_matrix(config.model_copy(update=more), study, tmp_path)
     assert "seeds has seeds of the search" in caplog.text
     with pytest.raises(ConfigError, match="cross_validation is missing"):
         cross_validation.make_matrix(config.model_copy(update={"cross_validation": None}), study, tmp_path)

@@ -1,6 +1,5 @@
 """Tables of a benchmark: means, deviations, intervals, what is missing; and the paper's numbers beside them."""
 
-import io
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -11,7 +10,6 @@ import numpy as np
 import pandas as pd
 import paper_tables
 import pytest
-from rich.console import Console
 from sb3_aarl.search.execution.matrix import Cell, cell_folder
 from sb3_aarl.search.results import table
 from sb3_aarl.search.studies.benchmark import read_variants
@@ -58,11 +56,9 @@ def plant(folder: Path, cell: Cell, curve: Mapping[int, float], checkpoints: Seq
 def printed(folder: Path) -> str:
     """All that is shown of a benchmark, in one line with single spaces."""
     found = table.read_tables(folder)
-    console = Console(width=1000, record=True, file=io.StringIO())
-    for shown in table.terminal_tables(found):
-        console.print(shown)
+    rows = [row for shown in table.text_tables(found).values() for row in shown.itertuples(index=False, name=None)]
     lines = [*table.footnotes(found), *table.missing(found.runs), *table.mixed(found.runs)]
-    return " ".join([*console.export_text().split(), *lines])
+    return " ".join([*(f"│ {' │ '.join(row)} │".replace("│  │", "│ │") for row in rows), *lines])
 
 
 def plant_scores(folder: Path, scores: Mapping[tuple[str, str], np.ndarray]) -> None:

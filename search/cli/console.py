@@ -73,11 +73,6 @@ def show_table(frame: "pd.DataFrame", title: str) -> None:
         )
     for row in frame.itertuples(index=False, name=None):
         table.add_row(*map(escape, row))
-    print_wide(table)
-
-
-def print_wide(table: Table) -> None:
-    """Print a table as wide as it is."""
     Console(width=1000).print(table)
 
 

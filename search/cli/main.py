@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 # The extras of modules that training does not need.
 EXTRAS = {"imageio": "search", "psycopg": "postgres", "ray": "ray", "submitit": "slurm"}
-SEARCH_MODULES = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "scipy", "sklearn", "sqlalchemy", "tenacity")
+SEARCH_MODULES = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "scipy", "sqlalchemy", "tenacity")
 
 
 class Program(TyperGroup):

@@ -89,7 +89,6 @@ def baselines(config: SearchFile, workers: Workers = 1, threads: Threads = None,
 @app.command(rich_help_panel="A search")
 def cross_validate(
     config: SearchFile,
-    top: Annotated[int | None, typer.Option(help="How many candidates. Default: the file's.", min=1)] = None,
     with_baselines: Annotated[
         bool, typer.Option("--baselines", help="Train the file's baselines too, with the same environments and seeds.")
     ] = False,
@@ -106,7 +105,7 @@ def cross_validate(
     found = Search.from_file(config, folder, threads=threads)
     settings, path = found.config, found.folder
     searched = load_study(open_storage(path, storage, create=False), settings.name)
-    matrix = cross_validation.make_matrix(settings, searched, path, top, settings.baselines if with_baselines else ())
+    matrix = cross_validation.make_matrix(settings, searched, path, settings.baselines if with_baselines else ())
     for part in cross_validation.rounds(settings, matrix):
         train_matrix(part, workers, settings.retries, config)
     table = compare(matrix, "Cross-validation, AULC: posterior mean, 95 % interval, probability to be the best")
@@ -125,7 +124,7 @@ def benchmark(
         list[Path],
         typer.Argument(
             callback=lambda paths: [find_file(path) for path in paths],
-            help=f"Hyper-parameters, one for each variant: {options.SHIPPED}, such as aarl_state; or a variants.yml.",
+            help=f"Hyper-parameters, one for each variant: {options.SHIPPED}; or a variants.yml.",
         ),
     ],
     variants: Annotated[str | None, typer.Option(help="Names of variants, such as aarl_state. Default: all.")] = None,

@@ -13,11 +13,11 @@ SearchFile = Annotated[
     Path,
     Argument(
         callback=lambda path: find_file(path, searches=True),
-        help="Configuration of a search: a file, or one of `aarl configs` by name, such as demo.",
+        help="Configuration of a search: a file, or a shipped one by name, such as demo.",
     ),
 ]
 BENCHMARK = Path("runs/benchmark")
-SHIPPED = "a file, or one of `aarl configs` by name"
+SHIPPED = "a file, or a shipped one by name, such as aarl_state"
 Imports = Annotated[str, Option(help="Modules of yours that register environments, such as my_env,other.")]
 DryRun = Annotated[
     bool, Option("--dry-run", help="Start nothing: measure some steps here, and show what all runs would cost.")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 from sb3_aarl.search.cli import options
-from sb3_aarl.search.cli.console import console, print_wide, say, say_json, show_table, time_to_go
+from sb3_aarl.search.cli.console import console, say, say_json, show_table, time_to_go
 from sb3_aarl.search.cli.options import Folder, Storage, open_study, search_folder
 
 app = typer.Typer()
@@ -31,8 +31,8 @@ def table(
     if json:
         say_json(tables.as_data(found))
         return
-    for shown in tables.terminal_tables(found):
-        print_wide(shown)
+    for title, shown in tables.text_tables(found).items():
+        show_table(shown, title)
     for line in tables.footnotes(found):
         console.print(line, highlight=False)
     for line in tables.missing(found.runs) + tables.mixed(found.runs):
@@ -75,23 +75,15 @@ def report(
     search: options.SearchFolder = None,
     storage: Storage = None,
     folder: Folder = None,
-    pattern: Annotated[
-        list[str] | None,
-        typer.Option(
-            help='A pattern beside those of table 5, in notation or by name, such as "{s_t} -> {r_t}"; may be repeated.'
-        ),
-    ] = None,
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
-    """Write a report of a search as one HTML file: best losses, cross-validation, patterns (table 5), importances, lineage."""
+    """Write a report of a search as one HTML file: best losses, cross-validation, patterns (table 5), lineage."""
     from sb3_aarl.search.execution.matrix import stored_scores
-    from sb3_aarl.search.results.analysis import PATTERNS
     from sb3_aarl.search.results.report import stored_baselines, write_report
 
     searched, path = open_study(folder or search, storage)
     out = out or path / "report.html"
-    patterns = {**PATTERNS, **{text: text for text in pattern or ()}}
-    write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"), patterns)
+    write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"))
     say(f"Report: {out}")
 
 

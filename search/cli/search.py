@@ -25,9 +25,6 @@ def search(
     ] = None,
     threads: Threads = None,
     generations: Annotated[int | None, typer.Option(help="Number of generations. Default: the file's.", min=1)] = None,
-    pruner: Annotated[
-        Literal["none", "median", "hyperband"] | None, typer.Option(help="Optuna's pruner. Default: the file's.")
-    ] = None,
     folder: Folder = None,
     executor: Annotated[
         Literal["local", "ray", "slurm"], typer.Option(help="Where runs are executed: on this machine, on Ray, or on Slurm.")
@@ -60,7 +57,7 @@ def search(
     from sb3_aarl.search.training.provenance import hide_password
 
     logging.set_verbosity(logging.WARNING)
-    found = Search.from_file(config, folder, storage, threads=threads, generations=generations, pruner=pruner)
+    found = Search.from_file(config, folder, storage, threads=threads, generations=generations)
     settings, path = found.config, found.folder
     at_once = workers or (1 if executor == "local" else settings.population_size * len(settings.seeds))
     if dry_run:

@@ -1,13 +1,12 @@
 """Commands for one run: train with a loss, list the losses that have a name; evaluate and film what was trained."""
 
-import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.table import Table
-from sb3_aarl.search.cli.console import console, errors, print_wide, say, say_json, time_to_go
+from sb3_aarl.search.cli.console import console, errors, say, say_json, time_to_go
 from sb3_aarl.search.cli.options import SHIPPED, Imports, Json, Model, modules
 from sb3_aarl.search.training.shipped import find_file
 
@@ -85,26 +84,6 @@ def losses(
     for name in names:
         table.add_row(name, escape(str(catalog.load(name))))
     console.print(table)
-
-
-@app.command(rich_help_panel="One agent")
-def configs() -> None:
-    """List the configurations that come with the package, for commands that take a file."""
-    from sb3_aarl.search.training.shipped import shipped_files
-
-    kinds = {"Hyper-parameters: aarl train --hyperparams NAME, aarl benchmark NAME": False, "Searches: aarl search NAME": True}
-    for title, searches in kinds.items():
-        table = Table("name", "what it is", title=title, title_justify="left")
-        table.columns[0].no_wrap = True
-        for name, path in shipped_files(searches).items():
-            table.add_row(name, first_sentence(path))
-        (console.print if console.is_terminal else print_wide)(table)
-
-
-def first_sentence(path: Path) -> str:
-    """The first sentence of the comment that a file begins with."""
-    comment = itertools.takewhile(lambda line: line.startswith("#"), path.read_text(encoding="utf-8").splitlines())
-    return " ".join(line.lstrip("# ") for line in comment).partition(". ")[0].rstrip(".:")
 
 
 @app.command(rich_help_panel="A search")

@@ -18,7 +18,7 @@ MOST_LOSSES = 1000
 LENGTHS = (4.0, 8.0, 16.0)
 SHARES = tuple((i / 8, j / 8, 1 - (i + j) / 8) for i in range(1, 7) for j in range(1, 8 - i))
 # The matrices are too small for threads: where runs have the cores, a fit with several takes a second, with one 16 ms.
-BLAS = ThreadpoolController()
+one_thread = ThreadpoolController().wrap(limits=1, user_api="blas")
 
 
 def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
@@ -53,9 +53,9 @@ class TokenModel:
         for form in list(self.scores)[:-MOST_LOSSES]:
             del self.scores[form]
         if self.scores:
-            with BLAS.limit(limits=1, user_api="blas"):
-                self._fit()
+            self._fit()
 
+    @one_thread
     def _fit(self) -> None:
         """Choose the most probable variances; all of SHARES count alike but those near 0, of which there are many."""
         runs = list(self.scores.values())
@@ -79,28 +79,28 @@ class TokenModel:
                     best, self.length, self.shares, self._factor = log_p, length, shares, factor
                     self._weights, self.variance = scale * weights, scale**2 * squares / n_runs
 
+    @one_thread
     def posterior(self, losses: Sequence[AuxLoss], own: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """
         Mean and covariance of the true values of losses; with ``own=False`` without what is not known of the part of each loss
         alone, which says nothing about which one to try.
         """
-        with BLAS.limit(limits=1, user_api="blas"):
-            points = features(losses, self.max_horizon)
-            to_known = self._kernel(cdist(points, self._points, "sqeuclidean"))
-            mean = self._centre + to_known @ self._weights
-            prior = self._kernel(cdist(points, points, "sqeuclidean"), own)
-            return mean, self.variance * (prior - to_known @ cho_solve(self._factor, to_known.T))
+        points = features(losses, self.max_horizon)
+        to_known = self._kernel(cdist(points, self._points, "sqeuclidean"))
+        prior = self._kernel(cdist(points, points, "sqeuclidean"), own)
+        covariance = self.variance * (prior - to_known @ cho_solve(self._factor, to_known.T))
+        return self._centre + to_known @ self._weights, covariance
 
     def _kernel(self, distances: np.ndarray, own: bool = True) -> np.ndarray:
         of_tokens, alone, _ = self.shares
         return of_tokens * np.exp(-distances / self.length) + own * alone * (distances == 0)
 
+    @one_thread
     def draw(self, losses: Sequence[AuxLoss], rng: np.random.Generator, own: bool = True) -> np.ndarray:
         """One draw of the true values of losses from the posterior."""
         mean, covariance = self.posterior(losses, own)
         covariance += 1e-6 * self.variance * np.eye(len(mean))  # losses may be almost alike
-        with BLAS.limit(limits=1, user_api="blas"):
-            return mean + np.linalg.cholesky(covariance) @ rng.standard_normal(len(mean))
+        return mean + np.linalg.cholesky(covariance) @ rng.standard_normal(len(mean))
 
     def rating(self, loss: AuxLoss) -> float:
         """The mean of the posterior of a loss."""

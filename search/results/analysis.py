@@ -9,12 +9,11 @@ import numpy as np
 import pandas as pd
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
-from sb3_aarl.search.evolution.space import loss_of, loss_to_params
+from sb3_aarl.search.evolution.space import loss_of
 from scipy.stats import ttest_ind
-from sklearn.ensemble import RandomForestRegressor
 
 from sb3_aarl import catalog
-from sb3_aarl.aux_loss import OPERATORS, AuxLoss
+from sb3_aarl.aux_loss import AuxLoss
 
 # Section 3.3, in the order of table 5.
 PATTERNS: Mapping[str, str | AuxLoss] = {
@@ -27,7 +26,7 @@ PATTERNS: Mapping[str, str | AuxLoss] = {
 # The other columns of table 5, one for each kind of token: n_target - n_source.
 COUNTS = tuple(f"{name}, n_target > n_source" for name in ("State", "Action", "Reward"))
 # Formats of the columns where these are not integers or .2f, and their headings where these are not their names.
-FORMATS = {"difference": "+.2f", "gain": "+.2f", "welch_p": ".2g", "importance": ".3f"}
+FORMATS = {"difference": "+.2f", "gain": "+.2f", "welch_p": ".2g"}
 HEADINGS = {
     **{"n": "Losses", "std": "Deviation", "number": "Trial", "device": "Trained on", "average": "Mean", "welch_p": "Welch p"},
     **{name: f"n {name[2:]}" for name in ("n_with", "n_without", "n_neither")},
@@ -148,31 +147,6 @@ def effects(table: pd.DataFrame, by: str | Sequence[str]) -> pd.DataFrame:
     return result.join(pd.DataFrame(tests, index=result.index, columns=["difference", "welch_p"], dtype=float))
 
 
-def importances(table: pd.DataFrame) -> pd.DataFrame | None:
-    """
-    How much of the scores each parameter of the losses explains: mean decrease of impurity in a random forest.
-
-    A loss has no parameters for tokens beyond its horizon: such a token is not chosen. The horizon and, if they vary,
-    operator and negatives are parameters too: what they explain is not attributed to the tokens. None if all scores are alike.
-    """
-    trials = analysed(table)
-    scores = trials["score"]
-    if scores.nunique() < 2:
-        return None
-    params = pd.DataFrame([loss_to_params(loss, OPERATORS) for loss in trials["loss"]], index=trials.index)
-    tokens = params.drop(columns=["horizon", "operator", "negatives"]).eq(True)
-    varied = [name for name in ("operator", "negatives") if trials[name].nunique() > 1]
-    others = trials[["horizon", *varied]].apply(lambda column: column.astype("category").cat.codes)
-    features = tokens.join(others)
-    # Optuna's settings of MeanDecreaseImpurityImportanceEvaluator.
-    forest = RandomForestRegressor(n_estimators=64, max_depth=64, random_state=0).fit(features, scores)
-    result = pd.DataFrame({"importance": forest.feature_importances_}, index=features.columns)
-    comparisons = {name: _compare(scores[tokens[name]], scores[~tokens[name]]) for name in tokens}
-    columns = ["difference", "n_with", "n_without"]
-    result = result.join(pd.DataFrame.from_dict(comparisons, orient="index", columns=columns))
-    return result.astype({"n_with": "Int64", "n_without": "Int64"}).sort_values("importance", ascending=False, kind="stable")
-
-
 def lineage(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
     """The best trial and all its ancestors, the latest first; ``gain`` is the score less that of the best parent."""
     numbers = set(ranked(table, direction)["number"][:1])
@@ -204,17 +178,12 @@ def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     return groups.size().to_frame("trials").join(sums)
 
 
-def summary(
-    trials: Sequence[FrozenTrial],
-    direction: StudyDirection = StudyDirection.MAXIMIZE,
-    patterns: Mapping[str, str | AuxLoss] = PATTERNS,
-) -> dict[str, pd.DataFrame]:
-    """Everything above for one study by name; ``operator`` only if it was searched, ``importances`` if scores differ."""
+def summary(trials: Sequence[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> dict[str, pd.DataFrame]:
+    """Everything above for one study by name; ``operator`` only if it was searched."""
     table = trial_table(trials)
     operator = ["operator", "negatives"]
     tables = {
-        "table5": table5(table, patterns).rename_axis("pattern"),
-        "importances": importances(table),
+        "table5": table5(table).rename_axis("pattern"),
         "horizon": effects(table, "horizon"),
         "operator": effects(table, operator) if len(analysed(table)[operator].drop_duplicates()) > 1 else None,
         "operation": effects(table, "operation"),

@@ -3,7 +3,7 @@
 import io
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.search import stored_settings
 from sb3_aarl.search.training.provenance import provenance
 
-from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.files import replace_text
 
 N_BEST = 10
@@ -46,7 +45,6 @@ def write_report(
     path: str | Path,
     baselines: Iterable[tuple[str, float]] = (),
     validation: pd.DataFrame | None = None,
-    patterns: Mapping[str, str | AuxLoss] = analysis.PATTERNS,
 ) -> None:
     """Write the report of a study, finished or not, with baselines and the runs of its cross-validation as one HTML file."""
     trials = study.get_trials(deepcopy=False)
@@ -57,7 +55,7 @@ def write_report(
         order = cross_validation.top_losses(study, len(best))
         best = best.drop_duplicates("canonical").sort_values("canonical", key=lambda losses: losses.map(order.index))
     title, baselines = study.study_name, list(baselines)
-    tables = analysis.summary(trials, study.direction, patterns)
+    tables = analysis.summary(trials, study.direction)
     started = [f"{trial.datetime_start:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_start]
     ended = [f"{trial.datetime_complete:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_complete]
     environment = jinja2.Environment(

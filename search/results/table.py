@@ -1,20 +1,26 @@
-"""A benchmark's runs as tables: means and deviations on each task, and rliable's statistics over tasks."""
+"""A benchmark's runs as tables: means and deviations on each task, rliable's statistics over tasks (Agarwal et al. 2021)."""
 
 import json
 import math
+from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
-from rich.markup import escape
-from rich.table import Table
 from sb3_aarl.search.execution.matrix import task_name
-from sb3_aarl.search.results.statistics import SUITE, improvements, interquartile_means
 from sb3_aarl.search.studies.benchmark import read_abouts
 from sb3_aarl.search.training.folder import FAILED, partial_curve
+from scipy import stats
 
 from sb3_aarl.envs import PREFIX
 
+# Resamples of the bootstrap.
+RESAMPLES = 9999
+CONFIDENCE = 0.95
+# Tasks whose returns are on one scale, 0 to 1000.
+SUITE = "DeepMind Control"
 # With more variants than that they go down the rows, and of their pairs those with the best one are shown.
 MANY = 6
 RUN_COLUMNS = ["variant", "environment", "seed", "checkpoint", "mean", "reason", "commit", "versions", "program", "episodes"]
@@ -54,6 +60,77 @@ def compare(runs: pd.DataFrame) -> pd.DataFrame:
     """Mean and sample deviation over seeds of each variant on each environment, with its planned and finished runs."""
     returns = runs.groupby(["checkpoint", "environment", "variant"], sort=False)["mean"]
     return returns.agg(planned="size", runs="count", mean="mean", std="std").reset_index()
+
+
+def interquartile_means(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    Interquartile mean (IQM) of the returns with a 95 % interval by stratified bootstrap (Agarwal et al. 2021, rliable):
+    percentiles over resamples of the seeds within each task.
+
+    It is over tasks of one scale: those of DeepMind Control together, each other environment by itself. Tasks count that all
+    variants have runs on, and of each variant the seeds that it has on all of them.
+    """
+    rows = []
+    scales = runs["environment"].map(lambda name: SUITE if name.startswith(PREFIX) else name).rename("tasks")
+    for (checkpoint, tasks), scale in runs.groupby(["checkpoint", scales], sort=False):
+        present = scale.dropna(subset="mean")
+        is_common = present.groupby("environment")["variant"].nunique() == present["variant"].nunique()
+        common = list(is_common.index[is_common])
+        skipped = ", ".join(map(task_name, is_common.index[~is_common]))
+        tasks = task_name(common[0]) if len(common) == 1 else tasks
+        for variant in present["variant"].unique() if common else ():
+            planned = scale[scale["environment"].isin(common) & (scale["variant"] == variant)]
+            matrix = planned.pivot(index="environment", columns="seed", values="mean").dropna(axis="columns")
+            samples = list(matrix.to_numpy())
+            iqm = _iqm(*samples) if matrix.size else math.nan
+            interval = _interval(samples, _iqm)
+            left_out = planned["mean"].count() - matrix.size
+            counts = (len(common), len(planned), matrix.size)
+            rows.append((checkpoint, tasks, variant, *counts, iqm, *interval, left_out, skipped))
+    columns = ["checkpoint", "tasks", "variant", "n_tasks", "planned", "runs", "iqm", "low", "high", "left_out", "skipped"]
+    return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
+
+
+def improvements(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    Probability that a run of one variant is better than one of another on the same task, a tie being half, as the mean over
+    all tasks that both have runs on (Agarwal et al. 2021, rliable), with a 95 % interval by stratified bootstrap, and where
+    that is one task the two-sided p of Mann and Whitney's test.
+    """
+    rows = []
+    for checkpoint, part in runs.dropna(subset="mean").groupby("checkpoint"):
+        returns = {key: group.to_numpy() for key, group in part.groupby(["variant", "environment"])["mean"]}
+        tasks = {variant: set(group) for variant, group in part.groupby("variant")["environment"]}
+        for variant, over in combinations(part["variant"].unique(), 2):
+            if common := sorted(tasks[variant] & tasks[over]):
+                samples = [returns[name, task] for name in (variant, over) for task in common]
+                probability, (low, high) = _improvement(*samples), _interval(samples, _improvement)
+                p = stats.mannwhitneyu(*samples).pvalue if len(common) == 1 else math.nan
+                rows.append((checkpoint, variant, over, len(common), probability, low, high, p))
+                rows.append((checkpoint, over, variant, len(common), 1 - probability, 1 - high, 1 - low, p))
+    return pd.DataFrame(rows, columns=["checkpoint", "variant", "over", "n_tasks", "probability", "low", "high", "p"])
+
+
+def _iqm(*samples: np.ndarray, axis: int = -1) -> Any:
+    return stats.trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
+
+
+def _improvement(*samples: np.ndarray, axis: int = -1) -> Any:
+    """Of the first half of the samples over the second: the share of all pairs that are better, averaged over the tasks."""
+    half = len(samples) // 2
+    pairs = zip(samples[:half], samples[half:], strict=True)
+    signs = [np.sign(ours[..., :, None] - others[..., None, :]).mean(axis=(-2, -1)) for ours, others in pairs]
+    return (1 + np.mean(signs, axis=0)) / 2
+
+
+def _interval(samples: Sequence[np.ndarray], statistic: Any) -> tuple[float, float]:
+    """rliable's own bootstrap needs an ``arch`` that pandas 3 breaks; scipy's, with a sample for each stratum, is the same."""
+    if min(map(len, samples)) < 2:
+        return math.nan, math.nan
+    settings = {"vectorized": True, "method": "percentile", "confidence_level": CONFIDENCE, "batch": 1000}
+    rng = np.random.default_rng(0)
+    interval = stats.bootstrap(samples, statistic, n_resamples=RESAMPLES, rng=rng, **settings).confidence_interval
+    return float(interval.low), float(interval.high)
 
 
 def missing(runs: pd.DataFrame) -> list[str]:
@@ -96,55 +173,35 @@ def read_tables(folder: Path) -> Tables:
     return Tables(runs, compare(runs), interquartile_means(runs), improvements(runs))
 
 
-def terminal_tables(tables: Tables) -> list[Table]:
-    """The scores, then the statistics over tasks, for each checkpoint."""
-    return [*_score_tables(tables.comparison), *_statistics_tables(tables.iqm, tables.better)]
-
-
-def _score_tables(comparison: pd.DataFrame) -> list[Table]:
-    """For each checkpoint tasks and variants, the fewer as columns."""
-    tables = []
-    for checkpoint, part in comparison.groupby("checkpoint"):
-        part = part.assign(cell=[_score(row) for row in part.to_dict("records")], task=part["environment"].map(task_name))
-        rows, columns = "task", "variant"
+def text_tables(tables: Tables) -> dict[str, pd.DataFrame]:
+    """Tables of texts by their titles: for each checkpoint the scores, then the statistics over tasks."""
+    texts = {}
+    for checkpoint, part in tables.comparison.groupby("checkpoint"):
+        part = part.assign(cell=part.apply(_score, axis=1), task=part["environment"].map(task_name))
+        rows, columns = "task", "variant"  # the fewer as columns
         if part["variant"].nunique() > max(MANY, part["task"].nunique()):
             rows, columns = columns, rows
-        matrix = part.pivot(index=rows, columns=columns, values="cell").fillna("")
-        matrix = matrix.loc[part[rows].unique(), part[columns].unique()]
-        table = Table("", title=f"{_steps(checkpoint)} steps scores")
-        for column in matrix:
-            table.add_column(escape(str(column)), justify="right")
-        for name, row in matrix.iterrows():
-            table.add_row(escape(str(name)), *row)
-        tables.append(table)
-    return tables
-
-
-def _statistics_tables(iqm: pd.DataFrame, better: pd.DataFrame) -> list[Table]:
-    tables = []
-    for checkpoint, part in iqm.groupby("checkpoint"):
-        table = Table("", "variant", "IQM", "95 % interval", "runs", title=f"Interquartile means at {_steps(checkpoint)}")
-        for row in part.to_dict("records"):
-            scale = f"{SUITE}, {row['n_tasks']} tasks" if row["n_tasks"] > 1 else row["tasks"]
-            mean = f"{row['iqm']:.1f}" if row["runs"] else "-"
-            interval = _range(row["low"], row["high"], ".1f")
-            table.add_row(scale, escape(row["variant"]), mean, interval, f"{row['runs']}/{row['planned']}")
-        tables.append(table)
-    for checkpoint, part in _few(better).groupby("checkpoint"):
+        texts[f"{_steps(checkpoint)} steps scores"] = _matrix(part, rows, columns)
+    for checkpoint, part in tables.iqm.groupby("checkpoint"):
+        scales = part["tasks"].where(part["n_tasks"] < 2, SUITE + ", " + part["n_tasks"].astype(str) + " tasks")
+        text = pd.DataFrame({"": scales, "variant": part["variant"], "IQM": part["iqm"].map("{:.1f}".format)})
+        text["IQM"] = text["IQM"].where(part["runs"] > 0, "-")
+        text["95 % interval"] = part.apply(_interval_text, axis=1, digits=".1f")
+        text["runs"] = part["runs"].astype(str) + "/" + part["planned"].astype(str)
+        texts[f"Interquartile means at {_steps(checkpoint)}"] = text
+    for checkpoint, part in _few(tables.better).groupby("checkpoint"):
+        p = part["p"].map(" p {:.2g}".format).where(part["p"].notna(), "")
+        cells = part["probability"].map("{:.2f} ".format) + part.apply(_interval_text, axis=1, digits=".2f") + p
         title = f"Probability that a run of the row is better than one of the column, at {_steps(checkpoint)}"
-        cells = [
-            f"{row['probability']:.2f} {_range(row['low'], row['high'], '.2f')}"
-            + ("" if math.isnan(row["p"]) else f" p {row['p']:.2g}")
-            for row in part.to_dict("records")
-        ]
-        matrix = part.assign(cell=cells).pivot(index="variant", columns="over", values="cell").fillna("")
-        variants = list(part["variant"].unique())
-        columns = [variant for variant in variants if variant in matrix] or list(matrix)
-        table = Table("", *map(escape, columns), title=title)
-        for variant in variants:
-            table.add_row(escape(variant), *matrix.loc[variant, columns])
-        tables.append(table)
-    return tables
+        texts[title] = _matrix(part.assign(cell=cells), "variant", "over")
+    return texts
+
+
+def _matrix(part: pd.DataFrame, rows: str, columns: str) -> pd.DataFrame:
+    """A table of cells, rows and columns in the order in which they are there first, those in both in that of the rows."""
+    matrix = part.pivot(index=rows, columns=columns, values="cell").fillna("")
+    heads = sorted(part[columns].unique(), key=[*part[rows].unique(), *part[columns].unique()].index)
+    return matrix.loc[part[rows].unique(), heads].rename_axis("").reset_index()
 
 
 def _few(better: pd.DataFrame) -> pd.DataFrame:
@@ -155,7 +212,7 @@ def _few(better: pd.DataFrame) -> pd.DataFrame:
 
 
 def footnotes(tables: Tables) -> list[str]:
-    """How to read :func:`terminal_tables`, as far as something in them has to be explained."""
+    """How to read :func:`text_tables`, as far as something in them needs it."""
     _, _, iqm, every = tables
     better = _few(every)
     lines = []
@@ -189,7 +246,7 @@ def _steps(checkpoint: Any) -> str:
     return f"{checkpoint // 1000}K" if checkpoint % 1000 == 0 else f"{checkpoint:,}"
 
 
-def _score(row: dict[Any, Any]) -> str:
+def _score(row: pd.Series) -> str:
     """Mean and deviation: integers on DeepMind Control; with the number of runs where some are missing."""
     number = "" if row["runs"] == row["planned"] else f" ({row['runs']}/{row['planned']})"
     if row["runs"] == 0:
@@ -200,6 +257,5 @@ def _score(row: dict[Any, Any]) -> str:
     return f"{row['mean']:.{digits}f}{deviation}{number}"
 
 
-def _range(low: float, high: float, digits: str) -> str:
-    # A backslash: rich would take brackets for markup.
-    return "-" if math.isnan(low) else rf"\[{low:{digits}}, {high:{digits}}]"
+def _interval_text(row: pd.Series, digits: str) -> str:
+    return "-" if math.isnan(row["low"]) else f"[{row['low']:{digits}}, {row['high']:{digits}}]"

@@ -225,16 +225,14 @@ def _check_folder(matrix: Matrix) -> None:
     """Refuse to add runs to those of a variant on an environment that were trained in another way."""
     stored = {(about["variant"], about["environment"]): about for about in read_abouts(matrix.folder).values()}
     for cell, about in matrix.abouts.items():
-        if difference := _difference(stored.get(cell[:2], about), about, "evaluations"):
-            problem = "{}={!r}, not {!r}".format(*difference)
-            raise ValueError(
-                f"{matrix.folder} has runs of {cell.variant} on {cell.environment} with {problem}: name another folder"
-            )
-
-
-def _difference(one: Mapping[str, Any], other: Mapping[str, Any], *keys: str) -> tuple[str, Any, Any] | None:
-    """The first setting in which two runs differ, with both values: their scores cannot be compared."""
-    # Runs that were trained by another program name it.
-    keys = (*keys, "evaluation_episodes", "program")
-    old, new = ({key: about.get(key) for key in keys} | about.get("hyperparameters", {}) for about in (one, other))
-    return next((found for found in differences(old, new) if found[0] not in FREE), None)
+        # Runs that were trained by another program name it.
+        old, new = (
+            {key: values.get(key) for key in ("evaluations", "evaluation_episodes", "program", "hyperparameters")}
+            for values in (stored.get(cell[:2], about), about)
+        )
+        for key, before, now in differences(old, new):
+            if (name := key.removeprefix("hyperparameters.")) not in FREE:
+                where = f"{cell.variant} on {cell.environment}"
+                raise ValueError(
+                    f"{matrix.folder} has runs of {where} with {name}={before!r}, not {now!r}: name another folder"
+                )

@@ -1,7 +1,7 @@
 """Configuration of a search: one YAML file, checked before anything runs."""
 
-import inspect
 from collections.abc import Mapping
+from dataclasses import fields
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,8 +17,10 @@ from pydantic import (
     PositiveInt,
     PrivateAttr,
     ValidationInfo,
+    create_model,
     field_validator,
 )
+from sb3_aarl.search.evolution.candidates import Settings
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import MAX_HORIZON, loss_to_params
 from sb3_aarl.search.training import config as training
@@ -26,7 +28,7 @@ from sb3_aarl.search.training.config import ConfigError, check_checkpoints
 from sb3_aarl.search.training.shipped import find_file
 
 from sb3_aarl import catalog
-from sb3_aarl.aux_loss import LONGEST_HORIZON, AuxLoss
+from sb3_aarl.aux_loss import AuxLoss
 
 
 def _ascending(steps: tuple[int, ...]) -> tuple[int, ...]:
@@ -128,9 +130,15 @@ class Baseline(BaseModel, frozen=True, extra="forbid"):
     overrides: Overrides = {}
 
 
-class SearchConfig(BaseModel, frozen=True, extra="forbid"):
+# The arguments of the sampler that are keys of a search, with their types and defaults.
+_OWN = ("seed", "n_generations", "initial")
+_KEYS: dict[str, Any] = {item.name: (item.type, item.default) for item in fields(Settings) if item.name not in _OWN}
+_Evolution: Any = create_model("_Evolution", **_KEYS)
+
+
+class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
     """
-    A search. Defaults are the paper's. What follows from ``population_size`` to ``again`` is as in ``AuxLossSampler``.
+    A search. Defaults are the paper's. Arguments of ``AuxLossSampler``, from ``population_size`` to ``again``, are keys too.
 
     :param path: The file that it was read from
     :param imports: Modules that are imported first, such as those that register environments
@@ -166,20 +174,6 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
     checkpoints: Checkpoints
     evaluation_episodes: PositiveInt = 10
     generations: PositiveInt = 7
-    population_size: PositiveInt = 100
-    n_random: NonNegativeInt = 100
-    n_prior: NonNegativeInt = 25
-    parents: float = 0.25
-    replacement: float = 0.5
-    crossover: float = 0.2
-    horizon_change: float = 0.1
-    random: float = 0.2
-    max_horizon: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = MAX_HORIZON
-    operators: tuple[str, ...] | None = None
-    allow_duplicates: bool = False
-    screening: PositiveInt = 1
-    parent_selection: Literal["best", "posterior"] = "best"
-    again: float = 0.0
     initial: tuple[AuxLoss, ...] = ()
     evolution_seed: NonNegativeInt = 0
     seeds: Seeds = (0,)
@@ -268,9 +262,8 @@ class SearchConfig(BaseModel, frozen=True, extra="forbid"):
 
     def sampler_settings(self) -> dict[str, Any]:
         """The arguments of ``AuxLossSampler``, the number of generations included."""
-        names = [name for name in inspect.signature(AuxLossSampler).parameters if name in type(self).model_fields]
-        others = {"n_generations": self.generations, "seed": self.evolution_seed}
-        return {**others, **{name: getattr(self, name) for name in names}}
+        others = {"n_generations": self.generations, "seed": self.evolution_seed, "initial": self.initial}
+        return {**others, **{name: getattr(self, name) for name in _KEYS}}
 
 
 def load_config(path: str | Path, **changes: Any) -> SearchConfig:

@@ -46,11 +46,9 @@ def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLos
     return losses[:top] + by_rating(losses[top:])[:top_rated]
 
 
-def make_matrix(
-    config: SearchConfig, study: optuna.Study, folder: Path, top: int | None = None, baselines: Sequence[Baseline] = ()
-) -> Matrix:
+def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselines: Sequence[Baseline] = ()) -> Matrix:
     """
-    Candidates and baselines x environments x seeds; ``top`` replaces the configuration's number of candidates.
+    Candidates and baselines x environments x seeds.
 
     :raises ValueError: when the configuration is not that of the study
     """
@@ -58,7 +56,7 @@ def make_matrix(
     check_study(study, config, free=("threads",))
     if {*config.seeds} & {*section.seeds} and {*config.tasks} & {*(section.environments or config.tasks)}:
         logger.warning("cross_validation.seeds has seeds of the search: scores that candidates were chosen for count again")
-    losses = top_losses(study, section.top, section.top_rated) if top is None else top_losses(study, top)
+    losses = top_losses(study, section.top, section.top_rated)
     candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
     n_more = section.budget - len(section.seeds) if section.budget else 0
     return _make_matrix(config, folder, [*candidates, *baselines], candidates, n_more)
@@ -66,7 +64,7 @@ def make_matrix(
 
 def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
     """
-    The parts of a matrix, each of which is to be trained before the next one is asked for: all of it or, with a budget, the
+    The parts of a matrix, each of which must be trained before the next one is asked for: all of it or, with a budget, the
     rounds of a race, which a loss leaves when a run of it fails.
     """
     section, baselines = _section(config), {baseline.name for baseline in config.baselines}

@@ -23,7 +23,6 @@ def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path
     by_name = {file.stem: file for file in files.values()} | files
     name = path.as_posix().removesuffix(".yml")
     if name not in by_name:
-        nearest = difflib.get_close_matches(name, by_name, n=1)
-        hint = f", nearest: {nearest[0]}" if nearest else ""
-        raise ValueError(f"{path} is no file, nor the name of one of `aarl configs`{hint}")
+        nearest = difflib.get_close_matches(name, by_name, n=1) or list(files)
+        raise ValueError(f"{path} is no file, nor the name of a shipped one, nearest: {', '.join(nearest)}")
     return by_name[name]
