@@ -45,17 +45,12 @@ def modules(imports: str) -> list[str]:
     return imports.split(",") if imports else []
 
 
-def run_folder(config: Path, folder: Path | None) -> Path:
-    """The folder of a search: ``folder`` if the user named one."""
-    return Path("runs") / config.stem if folder is None else folder
-
-
 def search_folder(folder: Path | None, storage: str | None) -> Path | None:
     """The folder of a search, named itself or by its configuration file, or the only one; None if there is a storage only."""
     from sb3_aarl.search.execution.storage import STUDY_FILE
 
     if folder is not None:
-        default = run_folder(folder, None)
+        default = Path("runs") / folder.stem
         is_config = folder.suffix.lower() in (".yml", ".yaml") or (not folder.exists() and default.exists())
         return default if is_config else folder
     if storage is not None:
