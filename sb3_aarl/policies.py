@@ -343,7 +343,7 @@ class SACAuxPolicy(SACPolicy):
         kwargs = dict(self.optimizer_kwargs)
         learns = any(parameter.requires_grad for parameter in self.critic.features_extractor.parameters())
         if learns and self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and not {"foreach", "fused"} & set(kwargs):
-            # Several times faster, equal but for rounding. An encoder without parameters is SB3's SAC, to the bit.
+            # Several times faster, equal except for rounding. An encoder without parameters is SB3's SAC, to the bit.
             kwargs["fused"] = True
         return self.optimizer_class(parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
 

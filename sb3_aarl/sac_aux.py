@@ -266,6 +266,8 @@ class SACAux(SAC):
         for name in ("tau", "gamma"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
+        if self.policy_kwargs.get("n_critics", 2) < 1:
+            raise ValueError(f"policy_kwargs: n_critics must be at least 1, not {self.policy_kwargs['n_critics']}")
         if self.precision not in ("fp32", "bf16"):
             raise ValueError(f"precision must be fp32 or bf16, not {self.precision!r}")
         fixed = np.flatnonzero(self.action_space.low == self.action_space.high)  # type: ignore[attr-defined]
