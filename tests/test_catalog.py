@@ -36,12 +36,8 @@ def read_latex(line: str) -> SETS:
         ("curl", 1, "s0", "s0", "bilinear", True),
         ("aarl-pixel", 4, "s1 a1 a2 a3", "r0 r1 s2 s3", "mse", False),
         ("aarl-state", 9, "s0 a0 a1 s2 a2 a3 r3 a4 r4 a5 a7 s8 a8 r8", "s1 s3 a4 s6 s9", "mse", False),
-        ("spr-1", 1, "s0 a0", "s1", "n_mse", False),
         ("spr-3", 3, "s0 a0 a1 a2", "s1 s2 s3", "n_mse", False),
-        ("spr-10", 10, "s0 a0 a1 a2 a3 a4 a5 a6 a7 a8 a9", "s1 s2 s3 s4 s5 s6 s7 s8 s9 s10", "n_mse", False),
-        ("atc-1", 1, "s0", "s1", "bilinear", True),
         ("atc-4", 4, "s0", "s1 s2 s3 s4", "bilinear", True),
-        ("atc-10", 10, "s0", "s1 s2 s3 s4 s5 s6 s7 s8 s9 s10", "bilinear", True),
     ],
 )
 def test_named_losses(name: str, horizon: int, source: str, target: str, operator: str, negatives: bool) -> None:

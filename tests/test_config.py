@@ -71,17 +71,6 @@ def test_the_papers_budgets(path: Path) -> None:
     assert len(config.baselines) == 3
 
 
-@pytest.mark.parametrize("path", [path for path in SEARCHES if path.stem.endswith("-small")], ids=lambda path: path.stem)
-def test_small_searches_are_smaller(path: Path) -> None:
-    small, whole = load_config(path), load_config(path.with_name(path.name.replace("-small", "")))
-    assert small.environment == whole.environment
-    assert small.cross_validation is not None and whole.cross_validation is not None
-    assert small.cross_validation.environments == whole.cross_validation.environments
-    for name in ("generations", "population_size", "n_random", "n_prior"):
-        assert getattr(small, name) < getattr(whole, name)
-    assert max(small.checkpoints) <= max(whole.checkpoints) / 5
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cheetah_run_state", "cheetah_run_pixel"])  # the others have the same baselines
 def test_every_baseline_can_be_built(name: str) -> None:
@@ -113,20 +102,6 @@ def test_all_searches_of_one_kind_have_the_same_baselines() -> None:
 
 
 # Searches.
-
-
-def test_defaults_are_the_papers(tmp_path: Path) -> None:
-    config = load_config(write(tmp_path))
-    expected = SearchConfig(
-        path=tmp_path / "search.yml",
-        environment="dm_control/cheetah-run-v0",
-        hyperparameters=tmp_path / "hyper.yml",
-        checkpoints=(400, 800),
-    )
-    assert config.model_dump() == expected.model_dump()
-    assert config.name == "search" and config.retries == 3 and config.threads == 1
-    settings = config.sampler_settings()
-    assert (settings["population_size"], settings["n_generations"], settings["initial"]) == (100, 7, ())
 
 
 def test_every_part_of_a_search_is_read(tmp_path: Path) -> None:
@@ -392,7 +367,7 @@ def test_an_environment_without_an_entry_is_named(tmp_path: Path) -> None:
         ("", "must hold a mapping"),
         ("a: 2020-13-45", "month"),
         ("a: &x [*x]", "Circular reference"),
-        ("a: " + "[" * 5000, "recursion"),
+        ("a: " + "[" * 1000, "recursion"),
         ("a: !!python/object/apply:subprocess.check_call [[touch, '{marker}']]", "line 1"),
         ("a: !!python/object/new:os.system ['touch {marker}']", "line 1"),
     ],

@@ -73,8 +73,3 @@ def test_batch_norm_sees_both_states_and_needs_no_target_networks() -> None:
     now, later = th.stack(values)[:, :16], th.stack(values)[:, 16:]
     wanted = batch.rewards[:, 0] + 0.9 * (1 - batch.dones[:, 0]) * (later.amin(0) - ent_coef * next_log_prob)
     th.testing.assert_close(loss, 0.5 * (now - wanted).pow(2).mean(1).sum())
-
-
-def test_an_unknown_norm_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown critic_norm 'group', expected one of None, layer, batch"):
-        make_model(policy_kwargs={"critic_norm": "group"})

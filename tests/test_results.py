@@ -1,7 +1,6 @@
 """The tables are those of the runs in results/, the texts are right about them, and the commands there work."""
 
 import itertools
-import math
 import re
 import runpy
 import shlex
@@ -36,12 +35,6 @@ def returns(variant: str, task: str = "cheetah-run") -> list[float]:
     """Returns of the last evaluations of GROUP/NAME/VARIANT, one for each seed."""
     folder, _, name = variant.rpartition("/")
     return [read_curve(path)[-1].mean for path in sorted((RESULTS / folder / "runs" / name / task).glob("seed-*/curve.csv"))]
-
-
-def are_close(one: list[float], other: list[float]) -> bool:
-    """Whether two means are less than two standard errors of their difference apart."""
-    error = math.sqrt(sum(statistics.variance(runs) / len(runs) for runs in (one, other)))
-    return abs(statistics.mean(one) - statistics.mean(other)) < 2 * error
 
 
 def shown(values: list[float]) -> str:
@@ -131,69 +124,3 @@ def test_a_search_found_what_its_texts_say() -> None:
     assert [str(resolve(variants[f"{name}_simba"]["aux_loss"])) for name in ("published", "evolved")] == list(ranked.index[:2])
     figures += [f"{score:.0f}" for score in ranked[:2]]
     assert [figure for figure in figures if figure not in README] == []
-
-
-def test_what_the_confirmations_say() -> None:
-    published, evolved = (returns(f"search/confirmation/{name}_simba") for name in ("published", "evolved"))
-    aarl, forward = (returns(f"agent/tasks/{name}_simba") for name in ("aarl", "forward"))
-    none = returns("agent/parts/sac_simba")
-    p = [mannwhitneyu(aarl, found).pvalue for found in (published, evolved, forward, none)]
-    assert min(p[:2]) > 0.05 > max(p[2:]) and max(none) < min(map(statistics.mean, (published, evolved, aarl, forward)))
-    in_float32 = [returns(f"search/confirmation_fp32/{name}_simba_fp32") for name in ("published", "evolved", "aarl", "sac")]
-    assert all(are_close(*pair) for pair in zip(in_float32, (published, evolved, aarl, none), strict=True))
-    assert min(mannwhitneyu(in_float32[2], found).pvalue for found in in_float32[:2]) > 0.05
-    assert max(mannwhitneyu(in_float32[3], found).pvalue for found in in_float32[:3]) < 0.05
-    for task in ("walker-walk", "reacher-hard"):
-        none = returns("search/confirmation_fp32/sac_simba_fp32", task)
-        others = [f"agent/tasks/{name}_simba" for name in ("aarl", "forward")]
-        assert all(are_close(none, returns(name, task)) for name in ("search/confirmation_fp32/published_simba_fp32", *others))
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_decisions_at_sb3s_size(task: str) -> None:
-    def small(name: str) -> list[float]:
-        return returns(f"paper/small/{name}", task)
-
-    choices = ("", "_separate", "_joint", "_predictor", "_bf16")
-    default, separate, joint, predictor, bf16 = (small(f"aarl_state_small{choice}") for choice in choices)
-    assert max(joint) < min(default + separate + predictor)
-    assert are_close(default, bf16) and statistics.stdev(bf16) > statistics.stdev(default)
-    for other in (separate, predictor):
-        assert statistics.mean(other) < statistics.mean(default) and statistics.stdev(other) > statistics.stdev(default)
-    curl, dense, identity = (small(f"{name}_small") for name in ("curl_state", "sac_dense_mlp", "sac_identity"))
-    assert max(curl + dense + identity) < min(default) and are_close(curl, dense) is (task == "walker-walk")
-    orthogonal = small("aarl_state_small_orthogonal")
-    assert (max(default) < min(orthogonal)) is (task == "walker-walk")
-
-
-def test_the_distance_of_sac_from_the_paper() -> None:
-    paper = paper_scores(4).query("checkpoint == 100_000").set_index(["environment", "column"])
-    mean, std, runs = paper.loc[("dm_control/cheetah-run-v0", "SAC-Identity"), ["paper_mean", "paper_std", "paper_runs"]]
-
-    def distance(choice: str) -> float:
-        """In standard errors of the difference."""
-        found = returns(f"paper/small/sac_identity_small{choice}")
-        return (mean - statistics.mean(found)) / math.sqrt(statistics.variance(found) / len(found) + std**2 / runs)
-
-    assert distance("") > distance("_orthogonal") > 2 > distance("_orthogonal_squashed")
-    identity, both, float32 = (
-        returns(f"paper/full_size/sac_identity{choice}") for choice in ("_bf16", "_orthogonal_squashed_bf16", "")
-    )
-    assert max(identity) < min(both) and max(both) < min(float32)
-    names = ("sac_identity_small", "sac_dense_mlp_small")
-    repeat_4, repeat_2 = (
-        [value for name in names for value in returns(f"paper/small/{name}{change}", "walker-walk")]
-        for change in ("", "_repeat_2")
-    )
-    aarl = returns("paper/small/aarl_state_small_repeat_2", "walker-walk")
-    assert max(repeat_4) < min(repeat_2) and are_close(repeat_2, aarl)
-
-
-def test_from_pixels() -> None:
-    def curve(variant: str) -> dict[int, float]:
-        folder = RESULTS / "pixels/cheetah_run/runs" / f"{variant}_pixel_128_bf16" / "cheetah-run/seed-0"
-        return {point.environment_steps: point.mean for point in read_curve(folder / "curve.csv")}
-
-    aarl, curl, sac = (curve(variant) for variant in ("aarl", "curl", "sac"))
-    assert all(aarl[steps] > curl[steps] for steps in aarl if steps >= 40_000)
-    assert max(aarl[20_000], curl[20_000]) < 14 < sac[20_000]

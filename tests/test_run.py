@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from hypothesis import given
 from hypothesis import strategies as st
 from sb3_aarl.search.training import run as module
-from sb3_aarl.search.training.config import ConfigError, checkpoint_interval, spread_checkpoints
+from sb3_aarl.search.training.config import ConfigError, spread_checkpoints
 from sb3_aarl.search.training.folder import Outcome, is_finished, read_outcome
 from sb3_aarl.search.training.provenance import read_about, write_about
 from sb3_aarl.search.training.run import Run, check_run, prepare_run, train
@@ -427,19 +427,6 @@ def test_a_run_too_short_to_learn_is_said_before_it_starts(caplog: pytest.LogCap
     assert [record.getMessage() for record in caplog.records] == [
         "all 64 agent steps are random actions, and nothing is learnt: learning_starts is 64"
     ]
-
-
-@pytest.mark.parametrize(
-    ("hyper", "interval"),
-    [
-        ({}, 1),
-        ({"train_freq": 5, "n_envs": 2, "env_kwargs": {"action_repeat": 4}}, 40),
-        ({"train_freq": (3, "step"), "n_envs": 2}, 6),
-        ({"train_freq": (1, "episode"), "env_kwargs": {"action_repeat": 4}}, 4),
-    ],
-)
-def test_a_rollout_is_an_interval(hyper: dict[str, Any], interval: int) -> None:
-    assert checkpoint_interval(hyper, "here") == interval
 
 
 @given(st.integers(1, 10**6), st.integers(1, 30), st.integers(1, 16))

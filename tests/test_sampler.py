@@ -468,18 +468,6 @@ def test_an_enqueued_loss_is_trained_in_a_random_slot() -> None:
     assert operations.count("random") == sampler_of(study).operations(2).count("random") - 2
 
 
-def test_an_enqueued_loss_that_is_invalid_costs_nothing() -> None:
-    study = make_study()
-    study.enqueue_trial(loss_to_params(AuxLoss.parse("{s_t} -> {s_t}")) | {"source/s_t": False})
-    trial = study.ask()
-    with pytest.raises(optuna.TrialPruned):
-        suggest_aux_loss(trial, 2)
-    study.tell(trial, state=TrialState.PRUNED)
-    assert sampler_of(study).progress(study)[0] == GenerationProgress(1, 12, 0, 0, 0)
-    run(study)
-    assert {key: loss for key, loss in losses_of(study).items() if loss} == losses_of(run(make_study()))
-
-
 @pytest.mark.parametrize(
     "given",
     [loss_to_params(WANTED), {"horizon": 2, "source/s_t": True, "target/r_t": True, "rate": 0.25}],

@@ -134,11 +134,6 @@ def test_probabilities_of_improvement_are_those_of_rliable(planted: pd.DataFrame
     assert len(result) == 2
 
 
-def test_ties_are_half(tmp_path: Path) -> None:
-    plant_scores(tmp_path, {(variant, CHEETAH): np.array([3.0, 3.0]) for variant in ("a", "b")})
-    assert list(table.improvements(table.read_runs(tmp_path))["probability"]) == [0.5, 0.5]
-
-
 def test_statistics_are_over_tasks_of_one_scale_that_all_variants_have(tmp_path: Path) -> None:
     scores = {
         ("a", CHEETAH): np.array([1.0, 2.0]),
