@@ -176,7 +176,7 @@ EPISODES = st.lists(
 
 
 @pytest.mark.filterwarnings("ignore:frame_stack=")
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     episodes=st.lists(EPISODES, min_size=1, max_size=4),
     capacity=st.integers(1, 14),
@@ -259,7 +259,7 @@ def test_whole_windows_are_drawn_uniformly(batch_size, horizon):
     windows = whole_windows(histories, buffer.buffer_size, horizon)
     np.random.seed(0)
     counts = dict.fromkeys(windows, 0)
-    for _ in range(1 + 200 * len(windows) // batch_size):
+    for _ in range(1 + 100 * len(windows) // batch_size):
         for env, number in buffer.sample_windows(batch_size, horizon).actions[:, 0]:
             counts[(int(env), int(number))] += 1
     assert chisquare(list(counts.values())).pvalue > 0.01
@@ -299,7 +299,7 @@ IMAGE = spaces.Box(0, 255, (40, 48, 3), np.uint8)
 ENDED = st.lists(st.tuples(st.integers(1, 9), st.sampled_from(["terminated", "truncated"])), min_size=1, max_size=5)
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     episodes=st.lists(ENDED, min_size=1, max_size=3),
     capacity=st.integers(1, 14),
@@ -434,7 +434,7 @@ def test_saved_and_loaded_it_is_the_same(copied, n_added):
 
 
 @pytest.mark.filterwarnings("ignore:frame_stack=")
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     episodes=st.lists(EPISODES, min_size=1, max_size=2),
     capacity=st.integers(2, 14),
@@ -841,8 +841,8 @@ def stacked_env(**kwargs: Any) -> gym.Env:
     ids=["normalized", "delayed", "skipped", "padded", "flattened", "goal"],
 )
 def test_a_detected_stack_that_does_not_hold_is_stored_as_sac_does(make_env):
-    theirs = small(SAC, make_env()).learn(40).replay_buffer
-    model = small(SACAux, make_env())
+    theirs = small(SAC, make_env(), learning_starts=100).learn(40).replay_buffer
+    model = small(SACAux, make_env(), learning_starts=100)
     with pytest.warns(UserWarning, match="whole observations are stored instead") as caught:
         model.learn(40)
     assert len(caught) == 1

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, SingleEpisodes, aulc, read_curve, write_curve
@@ -143,15 +143,6 @@ def test_training_ends_when_the_function_returns_false() -> None:
     model.learn(30, callback)
     assert model.num_timesteps == 20
     assert len(callback.curve) == 2
-
-
-def test_normalized_environments_share_their_statistics() -> None:
-    env, eval_env = (VecNormalize(DummyVecEnv([Walk])) for _ in range(2))
-    eval_env.training, eval_env.norm_reward = False, False
-    model = make_model(env)
-    model.learn(30, LearningCurveCallback(eval_env, [30], 1))
-    np.testing.assert_array_equal(eval_env.obs_rms.mean, env.obs_rms.mean)
-    assert env.obs_rms.mean.any()
 
 
 @pytest.mark.parametrize(

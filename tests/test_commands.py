@@ -280,14 +280,6 @@ def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
     assert "model.zip does not exist" in run("video", trained, code=2)
 
 
-def test_training_on_an_environment_of_ones_own(folder: Path) -> None:
-    (folder / "imported_env.py").write_text(OWN_ENV.replace("Shown-v0", "Imported-v0"))
-    arguments = ["train", "Imported-v0", "--steps", 300, "--evaluations", 1, "--episodes", 1, "--folder", "run"]
-    assert "unknown environment 'Imported-v0'" in run(*arguments, code=2)
-    run(*arguments, "--imports", "imported_env")
-    assert read_curve("run/curve.csv")[-1].environment_steps == 300
-
-
 @pytest.mark.parametrize(
     ("env", "policy"), [("Shown-v0", "MlpPolicy"), ("Image-v0", "CnnPolicy"), ("Parts-v0", "MultiInputPolicy")]
 )
