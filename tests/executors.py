@@ -4,6 +4,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+from sb3_aarl.search.execution.executors import LocalExecutor
 from sb3_aarl.search.training.folder import read_run
 from sb3_aarl.search.training.run import Run, train
 
@@ -26,6 +27,16 @@ class InProcess:
 
     def outcome(self, folder: Path) -> dict[str, Any]:
         return {"curve": [list(point) for point in train(folder)], "failure": None, "retry": False}
+
+
+class OneProcess(LocalExecutor):
+    """Trains the first run in a process, as on this machine, and the others in this one."""
+
+    n_runs = 0
+
+    def submit(self, fn: Any, /, *args: Any) -> "Future[Any]":
+        self.n_runs += 1
+        return super().submit(fn, *args) if self.n_runs == 1 else InProcess().submit(fn, *args)
 
 
 class Planted(InProcess):

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import typer
+from executors import InProcess
 from sb3_aarl.search.cli.main import app
 from sb3_aarl.search.studies.config import load_config
 from sb3_aarl.search.training.config import load_hyperparameters, read_yaml
@@ -51,6 +52,7 @@ def test_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     script = tmp_path / "blocks.py"
     script.write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sb3_aarl.search.execution.executors.LocalExecutor", lambda workers: InProcess())
     runpy.run_path(str(script), run_name="__main__")
 
 

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from executors import OneProcess
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 # What each prints at its end.
@@ -28,6 +29,7 @@ def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(EXAMPLES)
     monkeypatch.setenv("PYTHONPATH", "")  # which one of them sets
+    monkeypatch.setattr("sb3_aarl.search.execution.executors.LocalExecutor", OneProcess)
     monkeypatch.setattr(sys, "argv", [f"{name}.py", "--steps", "230"])
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     assert capsys.readouterr().out.splitlines()[-1].startswith(LAST[name])
