@@ -12,13 +12,12 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, EveryNTimesteps, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac.policies import CnnPolicy, SACPolicy
 from torch import nn
 
@@ -274,31 +273,6 @@ def test_vec_normalize_reaches_the_auxiliary_loss() -> None:
     np.testing.assert_allclose(seen[0].rewards, rewards, rtol=1e-4)
 
 
-@pytest.mark.parametrize("n_stack", [2, 3])
-def test_frame_stack_before_and_after_transposition(n_stack: int) -> None:
-    def images() -> gym.Env:
-        return ChannelLast(RandomEnv(image_space(2, 36, 40)))
-
-    models = []
-    for env in (
-        VecTransposeImage(VecFrameStack(DummyVecEnv([images]), n_stack)),
-        VecFrameStack(VecTransposeImage(DummyVecEnv([images])), n_stack),
-        VecFrameStack(DummyVecEnv([images]), n_stack),  # SB3 transposes it itself
-    ):
-        kwargs = {"features_extractor_kwargs": SMALL_CNN}
-        model = make_model(env, policy="CnnPolicy", policy_kwargs=kwargs)
-        store = model.replay_buffer.stores[""]
-        assert store.stack == n_stack and store.frame_shape == (2, 36, 40)
-        model.learn(20)
-        models.append(model)
-    assert_equal_parameters(models[0], models[1])
-    assert_equal_parameters(models[0], models[2])
-    # The third observation of an episode: its own frames, oldest first.
-    stacked = models[0].replay_buffer.observations[n_stack - 1, 0]
-    frames = models[0].replay_buffer.observations[:n_stack, 0, -2:]
-    np.testing.assert_array_equal(stacked, frames.reshape(stacked.shape))
-
-
 @pytest.mark.parametrize("use_expln", [False, True])
 def test_gsde(use_expln: bool) -> None:
     policy_kwargs = {"use_expln": use_expln, "log_std_init": -2.0, "clip_mean": 1.5}
@@ -506,25 +480,6 @@ def test_float_images_of_a_dict() -> None:
     assert_all_train(model)
 
 
-def test_network_arguments() -> None:
-    kwargs = {
-        "net_arch": {"pi": [7], "qf": [12, 6]},
-        "n_critics": 3,
-        "activation_fn": nn.Tanh,
-        "optimizer_class": th.optim.AdamW,
-        "optimizer_kwargs": {"weight_decay": 0.5},
-        "features_extractor_kwargs": {"features_dim": 8},
-    }
-    model = make_model(policy_kwargs=kwargs)
-    assert [layer.out_features for layer in model.actor.latent_pi if isinstance(layer, nn.Linear)] == [7]
-    assert [layer.out_features for layer in model.critic.qf0 if isinstance(layer, nn.Linear)] == [12, 6, 1]
-    assert len(model.critic.q_networks) == len(model.critic_target.q_networks) == 3
-    assert any(isinstance(layer, nn.Tanh) for layer in model.critic.qf2)
-    for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer):
-        assert isinstance(optimizer, th.optim.AdamW) and optimizer.param_groups[0]["weight_decay"] == 0.5
-    assert_all_train(model)
-
-
 def test_callbacks(tmp_path: Any) -> None:
     env = DummyVecEnv([lambda: Monitor(RandomEnv())])
     evaluation = EvalCallback(env, best_model_save_path=tmp_path, eval_freq=10, n_eval_episodes=2, verbose=0)
@@ -547,20 +502,12 @@ def test_callbacks(tmp_path: Any) -> None:
     assert_equal_parameters(best, checkpoint)
 
 
-def test_her() -> None:
+def test_her(caplog: pytest.LogCaptureFixture) -> None:
     kwargs: dict[str, Any] = {"replay_buffer_class": HerReplayBuffer, "buffer_size": 200, "learning_starts": 20}
     with pytest.raises(ValueError, match=r"HerReplayBuffer has no windows, .*pass aux_loss=None"):
         make_model(BitFlippingEnv(n_bits=4, continuous=True), "MultiInputPolicy", **kwargs)
     model = make_model(BitFlippingEnv(n_bits=4, continuous=True), "MultiInputPolicy", aux_loss="auto", **kwargs)
+    assert model.aux_loss is None and "HerReplayBuffer has no windows" in caplog.text
     moved = moved_by_training(model, 40)
     assert isinstance(model.replay_buffer, HerReplayBuffer) and model.replay_buffer.size() == 40
     assert moved.pop("head") == [] and all(map(all, moved.values()))
-
-
-def test_a_buffer_without_windows(caplog: pytest.LogCaptureFixture) -> None:
-    model = make_model(replay_buffer_class=ReplayBuffer, aux_loss="auto")
-    assert model.aux_loss is None and "ReplayBuffer has no windows" in caplog.text
-    moved = moved_by_training(model)
-    assert moved.pop("head") == [] and all(map(all, moved.values()))
-    with pytest.raises(ValueError, match="windows"):
-        make_model(replay_buffer_class=ReplayBuffer)
