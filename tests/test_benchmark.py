@@ -166,25 +166,17 @@ def test_a_run_that_is_there_twice_is_refused(folder: Path) -> None:
         read_curves(folder / "nowhere")
 
 
-def test_the_time_to_go_is_that_of_the_steps_that_are_left(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_to_go_is_that_of_the_runs_that_are_left(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_aarl.search.execution.matrix.POLL_SECONDS", 0)
-    matrix = load("mine.yml", seeds=[0, 1], checkpoints=[80], every=20)
-    paths = [cell_folder(Path("out"), cell) for cell in matrix.runs]
+    matrix = load("mine.yml", seeds=[0, 1, 2], checkpoints=[80])
+    curve = [Evaluation(80, 0.0, 0.0, 1, 40.0)]
     future: Future[Any] = Future()
-
-    def evaluate(path: Path, *steps: int) -> list[Evaluation]:
-        write_curve(path / "curve.csv", curve := [Evaluation(step, 0.0, 0.0, 1, step / 2) for step in steps])
-        return curve
-
-    paths[0].mkdir(parents=True)
-    evaluate(paths[0], 20)  # of an earlier session
     progress = run_matrix(matrix, SimpleNamespace(submit=lambda *_: future), workers=1)
-    assert next(progress).seconds_to_go == pytest.approx(40 * 1.75)
-    evaluate(paths[0], 20, 40)
-    assert next(progress).seconds_to_go == matrix_status(Path("out"))[1] == pytest.approx(40 * 1.5)
-    curve = evaluate(paths[0], 20, 40, 60, 80)
+    assert next(progress).seconds_to_go is None
+    write_curve(cell_folder(Path("out"), next(iter(matrix.runs))) / "curve.csv", curve)
     future.set_result({"curve": [list(point) for point in curve], "failure": None, "retry": False})
-    assert next(progress)[1:] == (1, 0, pytest.approx(40))
+    assert next(progress) == (3, 1, 0, pytest.approx(80))
+    assert matrix_status(Path("out"))[1] == pytest.approx(80)
 
 
 @pytest.mark.slow

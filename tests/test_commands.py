@@ -19,8 +19,8 @@ from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import suggest_aux_loss
 from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.studies.config import load_config
-from sb3_aarl.search.studies.cost import measure
 from sb3_aarl.search.training.run import prepare_run, train
+from sb3_aarl.search.training.setup import measure
 from sb3_aarl.search.training.shipped import ZOO, find_file
 from tiny import HYPERPARAMETERS, SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
@@ -87,7 +87,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the program runs."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("sb3_aarl.search.studies.cost.MEASURED_SECONDS", 0.2)
+    monkeypatch.setattr("sb3_aarl.search.training.setup.MEASURED_SECONDS", 0.2)
     return tmp_path
 
 
@@ -157,7 +157,7 @@ def test_init_writes_a_search_that_runs_and_overwrites_nothing(folder: Path) -> 
 def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder, SEARCH + "seeds: [0, 1]\n")
     measured: dict[str, dict[str, float]] = {}
-    monkeypatch.setattr("sb3_aarl.search.studies.cost.measure", lambda run: measured.setdefault("small", measure(run)))
+    monkeypatch.setattr("sb3_aarl.search.training.setup.measure", lambda run: measured.setdefault("small", measure(run)))
     output = run("search", "small.yml", "--workers", 4, "--dry-run")
     row = next(line for line in output.splitlines() if line.startswith("│ small"))
     runs, gradient_ms, hours, _, core_hours = map(float, row.replace("│", "").split()[2:])

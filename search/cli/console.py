@@ -79,7 +79,7 @@ def show_table(frame: "pd.DataFrame", title: str) -> None:
 def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
     """Measure one run of each kind, and show what all of them would cost, beside each other where there are cores for them."""
     import pandas as pd
-    from sb3_aarl.search.studies.cost import measure
+    from sb3_aarl.search.training.setup import measure
 
     if not kinds:
         say("All runs are finished.")

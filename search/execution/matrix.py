@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 from sb3_aarl.search.execution.executors import Executor
-from sb3_aarl.search.execution.queue import Queue, pace, seconds_to_go
+from sb3_aarl.search.execution.queue import Queue, seconds_to_go
 from sb3_aarl.search.training.config import check_checkpoints
 from sb3_aarl.search.training.folder import FAILED, Run, is_finished, partial_curve, prepare_run, read_outcome
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
@@ -113,22 +113,21 @@ def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: in
             write_about(path, before | about)
     queue = Queue(executor, workers, retries)
     jobs = {cell: queue.add(path, matrix.runs[cell]) for cell, path in folders.items() if not is_finished(path)}
-    paces = {cell: pace(run, partial_curve(folders[cell])) for cell, run in matrix.runs.items()}
+    seconds = [partial_curve(path)[-1].seconds for cell, path in folders.items() if cell not in jobs]
     failed: set[Cell] = set()
     while True:
         running = [cell for cell, job in jobs.items() if job.future is not None]
         queue.update()
         for cell in running:
             job = jobs[cell]
-            paces[cell] = pace(job.run, partial_curve(job.folder))
-            if job.failure is not None and not is_finished(job.folder):
+            if job.is_over and is_finished(job.folder):
+                seconds.append(partial_curve(job.folder)[-1].seconds)
+            elif job.failure is not None:
                 failed.add(cell)
                 if not (job.folder / FAILED).exists():  # its process was killed
                     replace_text(job.folder / FAILED, json.dumps({"reason": job.failure, "retry": True}) + "\n")
-        seconds = [seconds for _, seconds in paces.values() if seconds is not None]
-        left = sum(paces[cell][0] for cell in jobs if cell not in failed)
         n_finished = len(matrix.runs) - len(queue.jobs) - len(failed)
-        to_go = seconds_to_go(seconds, left, min(workers, len(queue.jobs)))
+        to_go = seconds_to_go(seconds, len(queue.jobs), min(workers, len(queue.jobs)))
         yield MatrixProgress(len(matrix.runs), n_finished, len(failed), to_go)
         if not queue.jobs:
             return

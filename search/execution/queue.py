@@ -88,18 +88,10 @@ class Queue:
         job.is_over = True
 
 
-def pace(run: Run, curve: Sequence[Evaluation]) -> tuple[float, float | None]:
-    """The share of a run that is left, and the seconds of the whole run at its pace, None before its first evaluation."""
-    if not curve:
-        return 1.0, None
-    done = curve[-1].environment_steps / run.checkpoints[-1]
-    return 1 - done, curve[-1].seconds / done
-
-
-def seconds_to_go(seconds: Sequence[float], left: float, at_once: int) -> float | None:
+def seconds_to_go(seconds: Sequence[float], left: int, at_once: int) -> float | None:
     """
-    Estimated seconds until all runs (or candidates) are over, None if unknown: from the seconds of some of them, how many are
-    left (with the remaining shares of started ones), and how many run at once.
+    Estimated seconds until all runs (or candidates) are over, None if unknown: from the seconds of finished ones, how many are
+    left, and how many run at once.
     """
     if left == 0:
         return 0.0

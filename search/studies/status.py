@@ -10,10 +10,10 @@ from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.execution import driver
-from sb3_aarl.search.execution.queue import pace, seconds_to_go
+from sb3_aarl.search.execution.queue import seconds_to_go
 from sb3_aarl.search.execution.storage import has_driver
 from sb3_aarl.search.studies.search import stored_settings
-from sb3_aarl.search.training.folder import RUN, is_running, partial_curve, read_outcome, read_run
+from sb3_aarl.search.training.folder import RUN, is_running, read_outcome
 from sb3_aarl.search.training.provenance import read_about
 
 from sb3_aarl.aux_loss import AuxLoss
@@ -47,13 +47,12 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     rows = []
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
         outcome = read_outcome(path)
-        curve = partial_curve(path) if outcome is None else outcome.curve
-        left, seconds = pace(read_run(path), curve)
-        failed = outcome is not None and outcome.failure is not None
-        states = outcome is not None and not failed, outcome is None and is_running(path), failed
-        rows.append((read_about(path)["variant"], *states, left if outcome is None else 0.0, seconds))
-    runs = pd.DataFrame(rows, columns=["variant", "done", "running", "failed", "left", "seconds"])
+        done, failed = (outcome is not None and (outcome.failure is None) == is_done for is_done in (True, False))
+        seconds = outcome.curve[-1].seconds if outcome is not None and done else None
+        rows.append((read_about(path)["variant"], done, outcome is None and is_running(path), failed, seconds))
+    runs = pd.DataFrame(rows, columns=["variant", "done", "running", "failed", "seconds"])
     by_variant = runs.groupby("variant", sort=False)
     table = by_variant[["done", "running", "failed"]].sum().astype(int)
     table.insert(0, "runs", by_variant.size())
-    return table.reset_index(), seconds_to_go(list(runs["seconds"].dropna()), runs["left"].sum(), int(runs["running"].sum()))
+    left = int((~runs["done"].astype(bool) & ~runs["failed"].astype(bool)).sum())
+    return table.reset_index(), seconds_to_go(list(runs["seconds"].dropna()), left, int(runs["running"].sum()))

@@ -1,9 +1,10 @@
-"""The environments and the model of a run, and a check that it can be trained."""
+"""The environments and the model of a run, a check that it can be trained, and what it would cost."""
 
 import functools
 import inspect
 import logging
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -11,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 from gymnasium import spaces
 from sb3_aarl.search.training.checkpoint import TruncateAt
 from sb3_aarl.search.training.config import (
@@ -26,10 +28,12 @@ from sb3_aarl.search.training.config import (
 from sb3_aarl.search.training.folder import MODEL, NORMALIZE, RUN, Run, one_line, read_run
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_aarl import AuxLoss, SACAux
+from sb3_aarl.buffers import ARRAYS, WindowReplayBuffer
 from sb3_aarl.callbacks import SingleEpisodes
 from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
 from sb3_aarl.sac_aux import default_learning_starts
@@ -41,6 +45,8 @@ FIXED = {"training": False, "norm_reward": False}
 VIDEO_SIZE = 320  # pixels of a film, height and width
 # Agent steps of a run that is tried out: so that there are windows.
 TRIED_STEPS = 20
+MEASURED_SECONDS = 2.0
+MEASURED_STEPS = 50  # at least, so that there are windows
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any = None, renders: bool = False) -> gym.Env:
@@ -175,6 +181,41 @@ def try_out(model: SACAux) -> None:
 
     model.verbose = model.learning_starts = 0
     model.learn(TRIED_STEPS * model.n_envs, step)
+
+
+def measure(run: Run) -> dict[str, float]:
+    """Train a run for some seconds, and return what the whole run would take here, evaluations included."""
+    th.set_num_threads(run.threads)
+    setup = Setup(run, run.environment)
+    with closing(setup.training_env()) as env:
+        model = setup.model(env)
+        learning_starts, gradient_steps = model.learning_starts, model.gradient_steps
+        model.learning_starts = MEASURED_STEPS - 2
+        model.learn(MEASURED_STEPS)  # the first of everything is slow
+        model.learning_starts = model.gradient_steps = 0  # actions of the policy, and no training
+        started = time.monotonic()
+        model.learn(10**9, lambda *_: time.monotonic() - started < MEASURED_SECONDS)  # type: ignore[arg-type]
+        agent_step = (time.monotonic() - started) / model.num_timesteps
+        n, started = 0, time.monotonic()
+        while time.monotonic() - started < MEASURED_SECONDS:
+            model.train(1, model.batch_size)
+            n += 1
+        gradient_step = (time.monotonic() - started) / n
+        episode = (setup.episode_steps or EPISODE_LENGTH) / setup.action_repeat
+        assert isinstance(model.train_freq, TrainFreq)
+        frequency, unit = model.train_freq
+        rollout = frequency * env.num_envs * (episode if unit == TrainFrequencyUnit.EPISODE else 1)
+        n_updates = max(0, setup.agent_steps - learning_starts) * (1 if gradient_steps < 0 else gradient_steps / rollout)
+        evaluated = len(run.checkpoints) * run.evaluation_episodes * episode
+        buffer = model.replay_buffer
+        assert isinstance(buffer, WindowReplayBuffer)
+        arrays = [*(store.frames for store in buffer.stores.values()), *(getattr(buffer, name) for name in ARRAYS)]
+        share = min(1.0, setup.agent_steps / buffer.buffer_size / env.num_envs)  # it takes memory as it fills
+    return {
+        "ms a gradient step": 1000 * gradient_step,
+        "hours": ((setup.agent_steps + evaluated) * agent_step + n_updates * gradient_step) / 3600,
+        "MB of buffer": share * sum(array.nbytes for array in arrays) / 1e6,
+    }
 
 
 def load_trained(
