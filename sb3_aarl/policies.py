@@ -81,6 +81,8 @@ def _image_advice(space: spaces.Space) -> str:
     shape = getattr(space, "shape", None) or ()
     if len(shape) == 2:
         return "An image has three dimensions: add a channel to it, such as GrayscaleObservation(env, keep_dim=True)"
+    if len(shape) == 1:
+        return "Vectors need MlpPolicy"
     if len(shape) > 3:
         return (
             "An image has three dimensions: stack RGB images with SB3's VecFrameStack, which stacks their channels, and grey "

@@ -220,7 +220,8 @@ class SACAux(SAC):
         try:
             self._aux = AuxOptions(**(self.aux_kwargs or {}))
         except TypeError as error:
-            raise ValueError(f"aux_kwargs: {str(error).partition(' got ')[2]}") from None
+            known = ", ".join(AuxOptions.__dataclass_fields__)
+            raise ValueError(f"aux_kwargs: {str(error).partition(' got ')[2]}, expected some of {known}") from None
         self._check_arguments()
         if isinstance(self.target_entropy, str) and self.target_entropy.startswith("auto_"):
             share = float(self.target_entropy.removeprefix("auto_"))
