@@ -37,7 +37,7 @@ def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
 
 @pytest.mark.slow
 def test_notebook(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """The code cells, one after the other; the notebook has the outputs of a whole run in it."""
+    """The code cells, one after the other, with few steps."""
     monkeypatch.setenv("STEPS", "200")
     monkeypatch.setenv("MPLBACKEND", "agg")
     cells = json.loads((EXAMPLES / "from_sac_to_sac_aux.ipynb").read_text(encoding="utf-8"))["cells"]
