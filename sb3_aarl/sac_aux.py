@@ -6,7 +6,7 @@ import logging
 import math
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -32,7 +32,7 @@ from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAux
 
 logger = logging.getLogger(__name__)
 
-COMPILED = ("_act", "_target_q", "_critic_loss", "_joint_critic_loss", "_aux_loss")
+COMPILED = ("_act", "_critic_loss", "_aux_loss")
 
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
 
@@ -42,23 +42,6 @@ def _computes_bf16(device: th.device) -> bool:
     if device.type == "cuda":
         return th.cuda.is_bf16_supported(including_emulation=False)
     return device.type != "cpu" or th.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
-
-
-def _soft_target(
-    next_q_values: Sequence[th.Tensor],
-    entropy_term: th.Tensor,
-    rewards: th.Tensor,
-    dones: th.Tensor,
-    discounts: th.Tensor | float,
-) -> th.Tensor:
-    """The target of the Q values: reward, and the smallest of the next Q values less ``entropy_term``; all (batch, 1)."""
-    next_q, _ = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True)  # type: ignore[arg-type]
-    return rewards + (1 - dones) * discounts * (next_q - entropy_term)
-
-
-def _q_loss(q_values: Sequence[th.Tensor], target_q: th.Tensor) -> th.Tensor:
-    """Half the sum of the critics' mean squared errors, as in SB3."""
-    return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
 
 
 def _shapes(parameters: Mapping[str, th.Tensor]) -> dict[str, th.Size]:
@@ -344,8 +327,6 @@ class SACAux(SAC):
                 update_actor = self._n_updates % self.policy_delay == 0
                 batch, windows = self._sample(batch_size)
                 log("largest_reward", batch.rewards.abs().max())
-                # n-step returns discount by gamma ** n_steps, by less where an episode ended.
-                discounts = self.gamma if batch.discounts is None else batch.discounts
                 if self.use_sde:
                     self.actor.reset_noise()
 
@@ -372,11 +353,7 @@ class SACAux(SAC):
 
                 # Critic and, through it, the encoder.
                 with autocast:
-                    if self.critic.norm == "batch":
-                        critic_loss = self._joint_critic_loss(trunk, batch, discounts, ent_coef)
-                    else:
-                        target_q = self._target_q(batch.next_observations, batch.rewards, batch.dones, discounts, ent_coef)
-                        critic_loss = self._critic_loss(trunk, batch.actions, target_q)
+                    critic_loss = self._critic_loss(trunk, batch, ent_coef)
                 log("critic_loss", critic_loss)
                 self.critic.optimizer.zero_grad()
                 if self._aux.joint:
@@ -409,35 +386,26 @@ class SACAux(SAC):
         actions, log_prob = self.actor.action_log_prob(observations)
         return actions, log_prob.reshape(-1, 1)
 
-    @th.no_grad()
-    def _target_q(
-        self,
-        next_observations: PyTorchObs,
-        rewards: th.Tensor,
-        dones: th.Tensor,
-        discounts: th.Tensor | float,
-        ent_coef: th.Tensor,
-    ) -> th.Tensor:
-        next_actions, next_log_prob = self._act(next_observations)
-        next_q_values = self.critic_target.q_values(self.critic_target.encode(next_observations), next_actions)
-        return _soft_target(next_q_values, ent_coef * next_log_prob, rewards, dones, discounts)
-
-    def _critic_loss(self, trunk: Trunk, actions: th.Tensor, target_q: th.Tensor) -> th.Tensor:
-        return _q_loss(self.critic.q_values(self.critic.encode(trunk), actions), target_q)
-
-    def _joint_critic_loss(
-        self, trunk: Trunk, batch: ReplayBufferSamples, discounts: th.Tensor | float, ent_coef: th.Tensor
-    ) -> th.Tensor:
-        """CrossQ's: both states in one batch, so that batch norm sees what it is used on; targets need no other networks."""
+    def _critic_loss(self, trunk: Trunk, batch: ReplayBufferSamples, ent_coef: th.Tensor) -> th.Tensor:
+        """Half the sum of the critics' mean squared errors, as in SB3."""
         latent = self.critic.encode(trunk)
         with th.no_grad():
             next_actions, next_log_prob = self._act(batch.next_observations)
-            next_latent = self.critic.encode(batch.next_observations)
-        with self.critic.batch_statistics():
-            both = self.critic.q_values(th.cat([latent, next_latent]), th.cat([batch.actions, next_actions]))
-        q_values, next_q_values = zip(*(q.chunk(2) for q in both), strict=True)
-        target_q = _soft_target(next_q_values, ent_coef * next_log_prob, batch.rewards, batch.dones, discounts)
-        return _q_loss(q_values, target_q.detach())
+            next_latent = (self.critic if self.critic.norm == "batch" else self.critic_target).encode(batch.next_observations)
+        if self.critic.norm == "batch":
+            # CrossQ: both states in one batch, so that batch norm sees what it is used on; no target Q networks.
+            with self.critic.batch_statistics():
+                both = self.critic.q_values(th.cat([latent, next_latent]), th.cat([batch.actions, next_actions]))
+            q_values, next_q_values = zip(*(q.chunk(2) for q in both), strict=True)
+        else:
+            q_values = self.critic.q_values(latent, batch.actions)
+            next_q_values = self.critic_target.q_values(next_latent, next_actions)
+        with th.no_grad():
+            next_q, _ = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True)
+            # n-step returns discount by gamma ** n_steps, by less where an episode ended.
+            discounts = self.gamma if batch.discounts is None else batch.discounts
+            target_q = batch.rewards + (1 - batch.dones) * discounts * (next_q - ent_coef * next_log_prob)
+        return 0.5 * th.stack([F.mse_loss(q, target_q) for q in q_values]).sum()
 
     def _actor_loss(self, observations: PyTorchObs, actions: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
         with th.no_grad():

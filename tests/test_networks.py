@@ -49,12 +49,12 @@ def test_batch_norm_sees_both_states_and_needs_no_target_networks() -> None:
     model = filled_model(policy_kwargs={"critic_norm": "batch"})
     for _ in range(3):
         model.train(1, batch_size=16)
-    batch, ent_coef = model.replay_buffer.sample(16), th.tensor(0.1)
+    batch, ent_coef = model.replay_buffer.sample(16)._replace(discounts=0.9), th.tensor(0.1)
     for parameter in (p for network in model.critic_target.q_networks for p in network.parameters()):
         parameter.data.fill_(th.nan)
     running = model.critic.qf0[0].running_mean.clone()
     th.manual_seed(1)
-    loss = model._joint_critic_loss(model.critic.trunk(batch.observations), batch, 0.9, ent_coef)
+    loss = model._critic_loss(model.critic.trunk(batch.observations), batch, ent_coef)
     assert not th.equal(running, model.critic.qf0[0].running_mean)
 
     th.manual_seed(1)
