@@ -34,7 +34,7 @@ def seeded() -> None:
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[Postgres]:
     """A server of this test process; each test makes a database of its own in it."""
-    server = Postgres(fsync="off")
+    server = Postgres()
     yield server
     server.close()
 

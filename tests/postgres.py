@@ -25,11 +25,10 @@ class Postgres:
     """
     A cluster. The superuser ``aarl`` logs in with a password.
 
-    :param settings: Settings of the server, over its defaults
     :raises RuntimeError: when PostgreSQL is not installed, or does not start
     """
 
-    def __init__(self, **settings: str):
+    def __init__(self) -> None:
         found = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: float(path.parent.name))
         which = shutil.which("postgres")
         if not found and which is None:
@@ -37,8 +36,6 @@ class Postgres:
         self._bin = found[-1] if found else Path(str(which)).parent
         self.port = free_port()
         self._folder = Path(tempfile.mkdtemp(prefix="aarl-postgres-"))
-        addresses = {"listen_addresses": "127.0.0.1", "unix_socket_directories": ""}
-        self._settings = {"port": str(self.port), **addresses, **settings}
         password_file = self._folder / "password"
         password_file.write_text(PASSWORD)
         if os.getuid() == 0:  # it refuses to run as root
@@ -63,9 +60,9 @@ class Postgres:
     def _log(self) -> str:
         return (self._folder / "log").read_text()[-2000:]
 
-    def url(self, database: str = "postgres", password: str = PASSWORD) -> str:
+    def url(self, database: str = "postgres") -> str:
         """URL of a database, without the name of a driver."""
-        return f"postgresql://{USER}:{password}@127.0.0.1:{self.port}/{database}"
+        return f"postgresql://{USER}:{PASSWORD}@127.0.0.1:{self.port}/{database}"
 
     def create(self, database: str) -> str:
         """Make a database; returns its URL."""
@@ -75,8 +72,9 @@ class Postgres:
 
     def start(self) -> None:
         """Start the server; returns when it accepts connections."""
-        settings = [word for name, value in self._settings.items() for word in ("-c", f"{name}={value}")]
-        self._process = self._run("postgres", "-D", str(self._folder / "data"), *settings)
+        settings = f"port={self.port} listen_addresses=127.0.0.1 unix_socket_directories= fsync=off".split()
+        words = [word for setting in settings for word in ("-c", setting)]
+        self._process = self._run("postgres", "-D", str(self._folder / "data"), *words)
         deadline = time.monotonic() + 30
         while True:
             try:
@@ -87,22 +85,13 @@ class Postgres:
                     raise RuntimeError(self._log()) from None
                 time.sleep(0.05)
 
-    @property
-    def pid(self) -> int:
-        """Number of the server's first process."""
-        return self._process.pid
-
-    def stop(self, crash: bool = False) -> None:
-        """
-        Stop the server, whoever is connected.
-
-        :param crash: Whether as after a loss of power: it has to recover when it is started
-        """
-        self._process.send_signal(signal.SIGQUIT if crash else signal.SIGINT)
+    def crash(self) -> None:
+        """Stop the server as after a loss of power: it has to recover when it is started."""
+        self._process.send_signal(signal.SIGQUIT)
         self._process.wait(timeout=30)
 
     def close(self) -> None:
         """Stop the server and delete all that it has."""
         if self._process.poll() is None:
-            self.stop(crash=True)
+            self.crash()
         shutil.rmtree(self._folder, ignore_errors=True)

@@ -8,6 +8,8 @@ from sb3_aarl.search.training.run import Run
 
 HYPERPARAMETERS: dict[str, Any] = {
     "policy": "MlpPolicy",
+    # An evaluation takes as long as its episodes.
+    "env_wrapper": {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 20}},
     "learning_starts": 40,
     "batch_size": 8,
     "aux_kwargs": {"predictor_width": 8},
