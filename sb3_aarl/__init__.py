@@ -2,12 +2,12 @@
 
 from typing import TYPE_CHECKING, Any
 
-from sb3_aarl.aux_loss import AuxLoss, search_space_size
+from sb3_aarl.aux_loss import AuxLoss
 
 if TYPE_CHECKING:
     from sb3_aarl.sac_aux import SACAux
 
-__all__ = ["AuxLoss", "SACAux", "search_space_size"]
+__all__ = ["AuxLoss", "SACAux"]
 __version__ = "0.2.0"
 
 

@@ -230,14 +230,3 @@ def _options(words: str, text: str) -> dict[str, Any]:
             raise ValueError(f"{word!r} is none of {', '.join(OPERATORS)}, negatives, horizon=k, each once only: {text!r}")
         options[key] = int(horizon[1]) if horizon else word if key == "operator" else True
     return options
-
-
-def search_space_size(max_horizon: int = 10) -> int:
-    """
-    Number of losses in the paper's search space (appendix C): ten operators times two masks of 3k + 1 bits for every k.
-
-    Invalid losses are counted, as in the paper.
-
-    :param max_horizon: Longest horizon k of the space
-    """
-    return 2 * len(OPERATORS) * sum(2 ** (2 * (3 * k + 1)) for k in range(1, max_horizon + 1))

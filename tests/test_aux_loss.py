@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_space import losses
 
-from sb3_aarl import AuxLoss, search_space_size
+from sb3_aarl import AuxLoss
 from sb3_aarl.aux_loss import Token
 
 # A busy machine is no failure.
@@ -241,10 +241,3 @@ def test_any_text_is_a_loss_or_a_value_error(text: str) -> None:
         assert str(error)
     else:
         assert AuxLoss.parse(str(loss)) == loss
-
-
-def test_search_space_size() -> None:
-    # Appendix C, 10 * (2^8 + 2^14 + ... + 2^62), worked out as a geometric series; the paper rounds it down to 4.6e19.
-    assert search_space_size() == search_space_size(10) == 2560 * (64**10 - 1) // 63 == 46848873837992512000
-    assert isinstance(search_space_size(10), int)
-    assert search_space_size(1) == 2560
