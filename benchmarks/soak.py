@@ -24,8 +24,13 @@ from sb3_aarl.search.execution.storage import open_storage
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from postgres import Postgres
-from program import start
 from tiny import SEARCH, write_search
+
+
+def start(*arguments: object, folder: Path) -> subprocess.Popen[str]:
+    """The program ``aarl`` as a process of its own."""
+    command = [sys.executable, "-m", "sb3_aarl.search.cli.main", *map(str, arguments)]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def slots(folder: Path, url: str | None) -> dict[str, Any]:
@@ -53,7 +58,7 @@ def disturb(config: Path, folder: Path, url: str | None, server: Postgres | None
             process = start(*arguments, folder=folder)
             counts["killed drivers"] += 1
         elif server is not None and not counts["restarted servers"] and minutes > 1:
-            server.stop(crash=True)
+            server.crash()
             time.sleep(5)
             server.start()
             counts["restarted servers"] += 1

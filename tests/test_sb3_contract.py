@@ -449,9 +449,11 @@ def test_normalize_images(space: spaces.Box, normalize: bool, largest: float) ->
     assert seen[-1] == largest
 
 
-@pytest.mark.parametrize("space", [spaces.Box(0, 1, (1, 36, 36)), VECTOR], ids=str)
-def test_what_is_no_image_is_refused(space: spaces.Space) -> None:
-    with pytest.raises(AssertionError, match="normalize_images=False"):
+@pytest.mark.parametrize(
+    ("space", "advice"), [(spaces.Box(0, 1, (1, 36, 36)), "normalize_images=False"), (VECTOR, "MlpPolicy")], ids=str
+)
+def test_what_is_no_image_is_refused(space: spaces.Space, advice: str) -> None:
+    with pytest.raises(AssertionError, match=advice):
         make_model(RandomEnv(space), "CnnPolicy")
 
 

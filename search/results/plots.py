@@ -50,9 +50,9 @@ def evolution_plot(
     return figure
 
 
-def learning_curves_plot(curves: pd.DataFrame) -> Figure:
+def learning_curves_plot(curves: pd.DataFrame, unit: str = "seed") -> Figure:
     """
-    Learning curves with their deviation over seeds, one panel a task: the paper's figure 9.
+    Learning curves with their deviation over seeds, one panel a task: the paper's figure 9; ``unit`` is what a seed is.
 
     A point is drawn where all seeds of its variant and task have one. The shade is the standard deviation over the seeds;
     where there is one seed only, over its episodes.
@@ -74,7 +74,7 @@ def learning_curves_plot(curves: pd.DataFrame) -> Figure:
                 axes.plot(points.index, points["mean"], color=colour, markevery=every, label=str(variant), **look)
                 low, high = points["mean"] - points["spread"], points["mean"] + points["spread"]
                 axes.fill_between(points.index, low, high, color=colour, alpha=0.18, linewidth=0)
-        axes.set_title(f"{task}\n{_seeds(curves[curves['env'] == task])}", fontsize=9)
+        axes.set_title(f"{task}\n{_seeds(curves[curves['env'] == task], unit)}", fontsize=9)
         axes.set_xlabel("Environment steps", fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -126,8 +126,8 @@ def count_candidates(table: pd.DataFrame) -> str:
     return f"{n} candidates{left_out}"
 
 
-def _seeds(curves: pd.DataFrame) -> str:
+def _seeds(curves: pd.DataFrame, unit: str) -> str:
     counts = curves.groupby("variant")["seed"].nunique()
     low, high = counts.min(), counts.max()
-    text = f"{low} to {high} seeds" if low < high else f"{low} seed{'s' if low > 1 else ''}"
+    text = f"{low} to {high} {unit}s" if low < high else f"{low} {unit}{'s' if low > 1 else ''}"
     return text + (" (shade of one: its episodes)" if low == 1 else "")
