@@ -79,7 +79,8 @@ def readme_table(rows: list[list[str]]) -> str:
 
 def sentence(text: str) -> str:
     """A text of tables.yml; a folder in braces becomes the mean of its last returns."""
-    return textwrap.fill(re.sub(r"\{([\w-]+/[\w/-]+)\}", lambda found: returns(RESULTS / found[1]).split()[0], text), 126)
+    text = re.sub(r"\{([\w-]+/[\w/-]+)\}", lambda found: returns(RESULTS / found[1]).split()[0], text)
+    return textwrap.fill(text, 126, break_on_hyphens=False)
 
 
 def returns(folder: Path) -> str:
