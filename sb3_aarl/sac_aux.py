@@ -613,7 +613,7 @@ class SACAux(SAC):
             self._compile_losses()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *COMPILED]
+        return [*super()._excluded_save_params(), *COMPILED, "batch_norm_stats", "batch_norm_stats_target"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -153,3 +153,9 @@ def test_other_parameters_keep_their_value_half_of_the_time_and_stay_near_it(
     assert 0.45 < kept < 0.85 and len(set(values)) >= 3
     if near is not None:
         assert np.mean([near[0] <= other <= near[1] for other in values]) > 0.75
+
+
+def test_the_ends_of_a_grid_are_drawn() -> None:
+    rng = np.random.default_rng(0)
+    distribution = FloatDistribution(0, 0.3, step=0.1)
+    assert {other_parameter(0.2, distribution, rng) for _ in range(500)} == {0.0, 0.1, 0.2, 0.3}

@@ -76,6 +76,10 @@ def search(
     elif executor == "slurm":
         from sb3_aarl.search.execution.slurm import SlurmExecutor
 
+        if gpus != int(gpus):
+            from sb3_aarl.files import ConfigError
+
+            raise ConfigError(f"--gpus-per-run: Slurm's jobs get whole GPUs, not {gpus}")
         parameters = (item.partition("=")[::2] for item in slurm or [])
         options_of_jobs: dict[str, Any] = {name: int(value) if value.isdigit() else value for name, value in parameters}
         running = SlurmExecutor(path / "slurm", cpus, int(gpus), **options_of_jobs)

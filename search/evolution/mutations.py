@@ -66,6 +66,9 @@ def other_parameter(value: Any, distribution: BaseDistribution, rng: np.random.G
     while True:
         number = float(unscale(rng.normal(scale(value), 0.2 * (high - low))))
         if distribution.step is not None:
-            number = distribution.low + distribution.step * round((number - distribution.low) / distribution.step)
+            steps = round((number - distribution.low) / distribution.step)
+            number = distribution.low + distribution.step * steps
+            if steps == round((distribution.high - distribution.low) / distribution.step):
+                number = distribution.high  # 0.3, where the sum is 0.30000000000000004
         if distribution.low <= number <= distribution.high:
             return int(number) if isinstance(distribution, IntDistribution) else number

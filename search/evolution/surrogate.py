@@ -82,11 +82,11 @@ class TokenModel:
     @one_thread
     def posterior(self, losses: Sequence[AuxLoss], own: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """
-        Mean and covariance of the true values of losses; with ``own=False`` without what is not known of the part of each loss
-        alone, which says nothing about which one to try.
+        Mean and covariance of the true values of losses; with ``own=False`` without the part of each loss alone, which says
+        nothing about which new one to try.
         """
         points = features(losses, self.max_horizon)
-        to_known = self._kernel(cdist(points, self._points, "sqeuclidean"))
+        to_known = self._kernel(cdist(points, self._points, "sqeuclidean"), own)
         prior = self._kernel(cdist(points, points, "sqeuclidean"), own)
         covariance = self.variance * (prior - to_known @ cho_solve(self._factor, to_known.T))
         return self._centre + to_known @ self._weights, covariance

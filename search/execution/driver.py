@@ -194,11 +194,12 @@ class Driver:
         self._note_runs(trial, [job for task in running.done for job in task])
         if failure is not None:
             self._fail(trial, failure)
-        elif not is_whole:
-            self._tell(trial, state=TrialState.PRUNED)
-        else:
-            self.n_failures = 0
+            return
+        self.n_failures = 0
+        if is_whole:
             self._tell(trial, values=score)
+        else:
+            self._tell(trial, state=TrialState.PRUNED)
 
     def _curves(self, jobs: Sequence[Job]) -> list[list[Evaluation]]:
         """The curves of jobs so far, on the scale of their environments' returns."""
