@@ -63,7 +63,7 @@ def test_the_posterior_is_that_of_all_runs_under_the_most_probable_variances() -
     left = prior(distances(queries, queries), length, of_tokens, own) - cross @ np.linalg.solve(covariance, cross.T)
     np.testing.assert_allclose(found_covariance, scores.var() * variance * left, rtol=1e-6, atol=1e-6)
     assert [model.rating(loss) for loss in queries] == pytest.approx(list(mean))
-    assert np.linalg.eigvalsh(model.posterior(queries, own=False)[1]).min() > 0
+    assert np.linalg.eigvalsh(model.posterior(queries, own=False)[1]).min() > -1e-6
     rng = np.random.default_rng(0)
     draws = np.array([model.draw(queries[:8], rng) for _ in range(10_000)])
     np.testing.assert_allclose(draws.mean(axis=0), mean[:8], atol=2)
