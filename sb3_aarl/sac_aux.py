@@ -71,7 +71,8 @@ class SACAux(SAC):
     :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth of
         the first ``learn`` if that is less: with fewer some runs of HalfCheetah never learn to run
     :param batch_size: Transitions for each critic and actor update
-    :param tau: Polyak coefficient of the target Q networks; 0 freezes the whole target critic, as in SB3
+    :param tau: Polyak coefficient of the target Q networks, of which ``critic_norm="batch"`` (default) uses none; 0 freezes
+        the whole target critic, as in SB3
     :param gamma: Discount factor
     :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
     :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. If one that
