@@ -392,15 +392,16 @@ class SACAux(SAC):
         latent = self.critic.encode(trunk)
         with th.no_grad():
             next_actions, next_log_prob = self._act(batch.next_observations)
-            next_latent = (self.critic if self.critic.norm == "batch" else self.critic_target).encode(batch.next_observations)
         if self.critic.norm == "batch":
             # CrossQ: both states in one batch, so that batch norm sees what it is used on; no target Q networks.
+            with th.no_grad():
+                next_latent = self.critic.encode(batch.next_observations)
             with self.critic.batch_statistics():
                 both = self.critic.q_values(th.cat([latent, next_latent]), th.cat([batch.actions, next_actions]))
             q_values, next_q_values = zip(*(q.chunk(2) for q in both), strict=True)
         else:
             q_values = self.critic.q_values(latent, batch.actions)
-            next_q_values = self.critic_target.q_values(next_latent, next_actions)
+            next_q_values = self.critic_target.q_values(self.critic_target.encode(batch.next_observations), next_actions)
         with th.no_grad():
             next_q, _ = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True)
             # n-step returns discount by gamma ** n_steps, by less where an episode ended.

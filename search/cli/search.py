@@ -50,6 +50,8 @@ def search(
     for name in meaningless:
         if values[name] is not None:
             raise ValueError(f"{name} has no meaning with --executor {executor}")
+    if executor == "slurm" and not float(gpus_per_run or 0).is_integer():
+        raise ValueError(f"--gpus-per-run: Slurm's jobs get whole GPUs, not {gpus_per_run}")
 
     from optuna import logging
     from sb3_aarl.search.execution.storage import STUDY_FILE
@@ -76,10 +78,6 @@ def search(
     elif executor == "slurm":
         from sb3_aarl.search.execution.slurm import SlurmExecutor
 
-        if gpus != int(gpus):
-            from sb3_aarl.files import ConfigError
-
-            raise ConfigError(f"--gpus-per-run: Slurm's jobs get whole GPUs, not {gpus}")
         parameters = (item.partition("=")[::2] for item in slurm or [])
         options_of_jobs: dict[str, Any] = {name: int(value) if value.isdigit() else value for name, value in parameters}
         running = SlurmExecutor(path / "slurm", cpus, int(gpus), **options_of_jobs)

@@ -285,9 +285,9 @@ def load_config(path: str | Path, **changes: Any) -> SearchConfig:
         raise ConfigError(f"{path}: {error}") from None
     section = config.cross_validation
     validated = (section.environments or tuple(config.tasks)) if section else ()
+    for env_id in config.tasks:
+        check_checkpoints(config.checkpoints_on(env_id), config.hyperparameters_for(env_id), f"{path}: {env_id}")
     for env_id in dict.fromkeys([*config.tasks, *validated]):
-        if env_id in config.tasks:
-            check_checkpoints(config.checkpoints_on(env_id), config.hyperparameters_for(env_id), f"{path}: {env_id}")
         for baseline in (None, *config.baselines):
             config.hyperparameters_for(env_id, baseline)
         if config.environments and config.returns_on(env_id) is None:

@@ -47,12 +47,13 @@ def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
     rows = []
     for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
         outcome = read_outcome(path)
-        done, failed = (outcome is not None and (outcome.failure is None) == is_done for is_done in (True, False))
+        done = outcome is not None and outcome.failure is None
+        failed = outcome is not None and not done
         seconds = outcome.curve[-1].seconds if outcome is not None and done else None
         rows.append((read_about(path)["variant"], done, outcome is None and is_running(path), failed, seconds))
     runs = pd.DataFrame(rows, columns=["variant", "done", "running", "failed", "seconds"])
     by_variant = runs.groupby("variant", sort=False)
     table = by_variant[["done", "running", "failed"]].sum().astype(int)
     table.insert(0, "runs", by_variant.size())
-    left = int((~runs["done"].astype(bool) & ~runs["failed"].astype(bool)).sum())
+    left = int((table["runs"] - table["done"] - table["failed"]).sum())
     return table.reset_index(), seconds_to_go(list(runs["seconds"].dropna()), left, int(runs["running"].sum()))
