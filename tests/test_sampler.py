@@ -396,6 +396,15 @@ def test_an_ask_beyond_the_free_slots_gets_one_more_offspring() -> None:
     assert key_of(study.ask()) == (2, 5 + 17, 0)
 
 
+def test_a_trial_that_stays_running_holds_up_no_generation() -> None:
+    study = make_study(population_size=np.int64(12), storage=RDBStorage("sqlite:///:memory:"))  # NumPy's numbers are numbers
+    suggest_aux_loss(study.ask())
+    study.optimize(lambda trial: score(suggest_aux_loss(trial)), 100, callbacks=[sampler_of(study).stop_when_complete])
+    assert len(study.trials) == 1 + 3 * 12
+    assert sampler_of(study).progress(study)[0] == GenerationProgress(1, 12, 12, 1, 0)
+    assert make_study(storage=study._storage).ask().user_attrs["generation"] == 3
+
+
 def test_after_the_last_generation_asking_still_works() -> None:
     study = run(make_study(n_generations=1))
     trial = study.ask()

@@ -46,6 +46,9 @@ class Settings:
     again: float = 0.0
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, np.generic):  # which no storage takes
+                setattr(self, name, value.item())
         self.operators = None if self.operators is None else tuple(self.operators)
         losses = self.initial if self.allow_duplicates else {loss.canonical(): loss for loss in self.initial}.values()
         self.initial = tuple(losses)

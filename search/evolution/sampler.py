@@ -48,7 +48,7 @@ class AuxLossSampler(Settings, BaseSampler):
 
     The first generation (the paper's "stage") has the losses of ``initial``, ``n_random`` random ones and ``n_prior`` from two
     priors. Each later one takes the best ``parents`` of the one before and fills its ``population_size`` slots in fixed
-    shares. It is over when every slot has a complete or pruned trial; the random slots of the next one come before that.
+    shares. It is over when it has as many complete or pruned trials as slots; the random slots of the next one come before.
 
     A trial gets its slot when it is asked for, and shows it in its user attributes ``generation``, ``slot``, ``attempt``,
     ``operation`` and ``parents``. Its loss depends on the seed, the slot and earlier generations, not on the number of trials
@@ -59,9 +59,9 @@ class AuxLossSampler(Settings, BaseSampler):
     are no others. What is searched beside the loss is inherited from a parent and, every other time, changed. Other samplers
     may hold this one (``PartialFixedSampler``, ``independent_sampler``): the loss of a trial is the one of its parameters.
 
-    Asking never waits. A trial that finds no free slot gets an extra one, with one more offspring of the last parents. Two
-    processes that ask at the same moment may train one slot's loss twice; the trial that finishes first counts. Trials of a
-    killed program stay RUNNING and hold their slots: report ``TrialState.FAIL`` for them.
+    Asking never waits. A trial that finds no free slot gets an extra one, with one more offspring of the last parents, so that
+    no generation waits for trials that a killed process left RUNNING. Two processes that ask at the same moment may train one
+    slot's loss twice; the trial that finishes first counts.
 
     :param population_size: Slots of every generation but the first (paper: 100)
     :param n_random: Random losses of the first generation (paper: 100)
@@ -269,13 +269,16 @@ class _Slots:
                 result = Result(trial.number, loss, score if is_feasible and math.isfinite(score) else math.nan)
             if generation >= self.candidates.generation:  # else the choice of parents is settled
                 self.results[generation].setdefault(slot, result)
-            while not self._open(self.candidates.generation):
-                of_generation = sorted(self.results[self.candidates.generation].items())
+            while len(filled := self.results[self.candidates.generation]) >= self._size(self.candidates.generation):
+                of_generation = sorted(filled.items())
                 self.candidates.end_generation([result for _, result in of_generation if result is not None])
+
+    def _size(self, generation: int) -> int:
+        return len(self.sampler.operations(generation))
 
     def _open(self, generation: int) -> list[int]:
         """Slots without a result."""
-        return [slot for slot in range(len(self.sampler.operations(generation))) if slot not in self.results[generation]]
+        return [slot for slot in range(self._size(generation)) if slot not in self.results[generation]]
 
     def free(self) -> list[tuple[int, int]]:
         """Slots of this generation without a trial, and random ones of the next."""
@@ -285,10 +288,9 @@ class _Slots:
         return [at for at in slots if at[0] <= self.last and at not in self.running]
 
     def progress(self, generation: int) -> GenerationProgress:
-        size, unfilled = len(self.sampler.operations(generation)), self._open(generation)
-        running = sum((generation, slot) in self.running for slot in unfilled)
+        running = sum((generation, slot) in self.running for slot in self._open(generation))
         failed = sum(number for (of, _), number in self.failed.items() if of == generation)
-        return GenerationProgress(generation, size, size - len(unfilled), running, failed)
+        return GenerationProgress(generation, self._size(generation), len(self.results[generation]), running, failed)
 
     def assign(self, number: int, is_enqueued: bool) -> dict[str, Any]:
         """The system attributes of the trial of this number, which is asked for."""
@@ -298,11 +300,10 @@ class _Slots:
             free.sort(key=lambda at: self.sampler.operations(at[0])[at[1]] != "random")
         if not free:
             generation = int(min(self.candidates.generation, self.last))
-            free = [(generation, len(self.sampler.operations(generation)) + number)]
+            free = [(generation, self._size(generation) + number)]
             others = [other for other in self.unfinished if other != number]
-            logger.warning(
-                "Trial %d gets an extra slot of generation %d: running trials %s hold the others", number, generation, others
-            )
+            why = f"running trials {others} hold the others" if generation == self.candidates.generation else "it is over"
+            logger.warning("Trial %d gets an extra slot of generation %d: %s", number, generation, why)
         (generation, slot), attempt = free[0], self.failed[free[0]]
         key: dict[str, Any] = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
         key |= {"max_horizon": self.sampler.max_horizon, "operators": self.sampler.operators}
