@@ -16,10 +16,21 @@ def _check_crop(images: th.Tensor, size: int) -> None:
         )
 
 
-def _cut(images: th.Tensor, top: th.Tensor, left: th.Tensor, height: int, width: int) -> th.Tensor:
-    """Of image i, ``height`` x ``width`` pixels from row ``top[i]`` and column ``left[i]`` on."""
-    views = images.unfold(2, height, 1).unfold(3, width, 1)  # all positions at once, nothing copied yet
-    return views[th.arange(len(images), device=images.device), :, top, left]
+def cut(images: th.Tensor, numbers: th.Tensor, top: th.Tensor, left: th.Tensor, height: int, width: int) -> th.Tensor:
+    """
+    Parts of images, (..., channels, height, width); several times faster than indexing with slices or lists.
+
+    :param images: (n, channels, rows, columns)
+    :param numbers: Of the images, (...); first row and column ``top`` and ``left`` of each part broadcast to it
+    :param height: Rows of each part
+    :param width: Columns of each part
+    """
+    _, channels, n_rows, n_columns = images.shape
+    channel, row = (th.arange(length, device=images.device) for length in (channels, height))
+    rows = ((numbers[..., None] * channels + channel)[..., None] * n_rows + row) * n_columns
+    starts = rows + (top * n_columns + left)[..., None, None]
+    pixels = images.flatten().unfold(0, width, 1)  # as many as are in a row of a part, from each one on; nothing is copied
+    return pixels.index_select(0, starts.flatten()).view(*numbers.shape, channels, height, width)
 
 
 def random_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
@@ -36,7 +47,7 @@ def random_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
         return images
     top = th.randint(height - size + 1, (batch,), device=images.device)
     left = th.randint(width - size + 1, (batch,), device=images.device)
-    return _cut(images, top, left, size, size)
+    return cut(images, th.arange(batch, device=images.device), top, left, size, size)
 
 
 def random_shift(images: th.Tensor, pad: int = 4) -> th.Tensor:
@@ -50,7 +61,7 @@ def random_shift(images: th.Tensor, pad: int = 4) -> th.Tensor:
     # Padding by replication knows no integers; pixels are exact in float32.
     padded = F.pad(images.float(), (pad,) * 4, mode="replicate").to(images.dtype)
     top, left = th.randint(2 * pad + 1, (2, batch), device=images.device)
-    return _cut(padded, top, left, height, width)
+    return cut(padded, th.arange(batch, device=images.device), top, left, height, width)
 
 
 def center_crop(images: th.Tensor, size: int = 84) -> th.Tensor:

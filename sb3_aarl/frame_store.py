@@ -9,6 +9,8 @@ from gymnasium.wrappers import FrameStackObservation
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
+from sb3_aarl.augmentation import cut
+
 
 def rows_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Whether all values of a row are equal, (n,), of two arrays that broadcast to (n, ...)."""
@@ -97,12 +99,12 @@ class FrameStore:
         back = np.arange(self.stack)[::-1]
         rows = (newest[..., None] - np.minimum(back, age[..., None])) % len(self.frames)
         numbers = th.from_numpy(rows * self.n_envs + (indices % self.n_envs)[..., None])
+        frames = th.from_numpy(self.frames).flatten(0, 1)
         if crop_size is None:
-            frames = th.from_numpy(self.frames).flatten(0, 1).index_select(0, numbers.flatten())
-        else:
+            stacked = frames.index_select(0, numbers.flatten()).view(*numbers.shape, *self.frame_shape)
+        else:  # ten times as fast as a crop of gathered frames
             top, left = (th.randint(length - crop_size + 1, newest.shape) for length in self.frame_shape[1:])
-            frames = self._crops(numbers, top, left, crop_size)
-        stacked = frames.view(*numbers.shape, *frames.shape[1:])
+            stacked = cut(frames, numbers, top[..., None], left[..., None], crop_size, crop_size)
         indices = np.broadcast_to(indices, newest.shape)
         # Few are at an episode's end or start.
         for index in map(tuple, np.argwhere(final).tolist()):
@@ -116,18 +118,6 @@ class FrameStore:
         for index in map(tuple, np.argwhere(padded).tolist()):
             stacked[index] = 0
         return stacked.flatten(newest.ndim, newest.ndim + 1)
-
-    def _crops(self, numbers: th.Tensor, top: th.Tensor, left: th.Tensor, size: int) -> th.Tensor:
-        """
-        Crops of the frames with these numbers (..., stack) in memory, (number of frames, channels, size, size), from these
-        first rows and columns (...): ten times as fast as a crop of gathered frames.
-        """
-        channels, height, width = self.frame_shape
-        rows = ((numbers[..., None] * channels + th.arange(channels))[..., None] * height + th.arange(size)) * width
-        starts = rows + (top * width + left)[..., None, None, None]
-        # ``size`` pixels from every one on, nothing copied yet.
-        pixels = th.from_numpy(self.frames).flatten().unfold(0, size, 1)
-        return pixels.index_select(0, starts.flatten()).view(-1, channels, size, size)
 
     def training_state(self, n_added: int) -> dict[str, th.Tensor]:
         """What ``n_added`` transitions have stored, for ``load_training_state``; it shares memory with the store."""

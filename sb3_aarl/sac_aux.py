@@ -48,6 +48,10 @@ def _shapes(parameters: Mapping[str, th.Tensor]) -> dict[str, th.Size]:
     return {name: value.shape for name, value in parameters.items()}
 
 
+def _n_parameters(optimizer: Mapping[str, Any]) -> int:
+    return sum(len(group["params"]) for group in optimizer.get("param_groups", []))
+
+
 def default_learning_starts(total_timesteps: int) -> int:
     """Agent steps with random actions in a run of ``total_timesteps``, unless ``learning_starts`` says how many."""
     return min(5000, total_timesteps // 10)
@@ -69,7 +73,7 @@ class SACAux(SAC):
     :param learning_rate: Of all optimizers that have none of their own, may be a schedule
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth of
-        the first ``learn`` if that is less: with fewer some runs of HalfCheetah never learn to run
+        the first ``learn`` if that is less
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks, of which ``critic_norm="batch"`` (default) uses none; 0 freezes
         the whole target critic, as in SB3
@@ -95,7 +99,7 @@ class SACAux(SAC):
         targets, entropy, losses and predictions stay float32. A device without instructions for it (of x86 processors those
         without AVX-512) would be ten times slower: it computes in float32, and logs a warning
     :param compile: Whether ``torch.compile`` compiles the losses in the first gradient steps, which takes a minute. It pays
-        for wide networks and long runs; without a C++ compiler logs a warning and nothing is compiled
+        for wide networks and long runs
     :raises ValueError: for arguments that do not fit, with the culprit's name
 
     Training stops with :class:`NonFiniteError` where something is NaN or infinite, and with
@@ -192,7 +196,6 @@ class SACAux(SAC):
         self._q_value_check = QValueCheck()
         self._stored_timesteps = 0  # steps whose transitions are in the buffer
         self._frame_stack: int | dict[str, int] = 1  # as detected; saved, since load() may have no wrappers to look at
-        self._warned: set[str] = set()
 
         if _init_setup_model:
             self._setup_model()
@@ -258,12 +261,6 @@ class SACAux(SAC):
         fixed = np.flatnonzero(self.action_space.low == self.action_space.high)  # type: ignore[attr-defined]
         if len(fixed):
             raise ValueError(f"action_space has low == high at index {fixed[0]}: remove what cannot be chosen from the action")
-        buffer_class = self.replay_buffer_class or WindowReplayBuffer
-        if isinstance(self.aux_loss, AuxLoss) and not issubclass(buffer_class, WindowReplayBuffer):
-            raise ValueError(
-                f"{buffer_class.__name__} has no windows, which aux_loss={self.aux_loss} needs: pass aux_loss=None, or a "
-                "buffer derived from WindowReplayBuffer"
-            )
 
     def _setup_aux_loss(self) -> None:
         encoder = [parameter for parameter in self.critic.features_extractor.parameters() if parameter.requires_grad]
@@ -271,7 +268,7 @@ class SACAux(SAC):
         if not encoder:
             problem = f"{type(self.critic.features_extractor).__name__} has no parameters that the auxiliary loss could train"
         elif not isinstance(self.replay_buffer, WindowReplayBuffer):
-            problem = f"{type(self.replay_buffer).__name__} has no windows"
+            problem = f"{type(self.replay_buffer).__name__} has no windows, as buffers derived from WindowReplayBuffer have"
         if self.aux_loss == "auto" and problem:
             logger.warning("aux_loss='auto': training without an auxiliary loss, since %s", problem)
             self.aux_loss = None
@@ -292,12 +289,6 @@ class SACAux(SAC):
             self.critic.optimizer = self.policy.make_optimizer(self.critic.q_parameters, self.lr_schedule)
 
     def _compile_losses(self) -> None:
-        try:
-            th.compile(th.square)(th.ones(1, device=self.device))
-        except RuntimeError as error:
-            problem = str(error).partition("\n")[0]
-            logger.warning("compile=True: torch.compile does not work here, nothing is compiled: %s", problem)
-            return
         # The actor loss stays as it is: compiled, its backward pass computes gradients of the critics too.
         for name in COMPILED:
             # The random numbers are PyTorch's own.
@@ -371,11 +362,9 @@ class SACAux(SAC):
                     with autocast:
                         actor_loss = self._actor_loss(batch.observations, actions_pi, log_prob, ent_coef)
                     log("actor_loss", actor_loss)
-                    trained = [p for p in self.actor.optimizer.param_groups[0]["params"] if p.requires_grad]
-                    if trained:
-                        self.actor.optimizer.zero_grad()
-                        actor_loss.backward(inputs=trained)
-                        self.actor.optimizer.step()
+                    self.actor.optimizer.zero_grad()
+                    actor_loss.backward(inputs=[p for p in self.actor.optimizer.param_groups[0]["params"] if p.requires_grad])
+                    self.actor.optimizer.step()
 
                 if self._n_updates % self.target_update_interval == 0:
                     self._update_target()
@@ -520,16 +509,10 @@ class SACAux(SAC):
         if self.learning_starts is None:
             self.learning_starts = default_learning_starts(total_timesteps)
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        if not self._n_updates and self.gradient_steps != 0:
-            self._warn_once("nothing was learnt: learning starts after %d agent steps", self.learning_starts)
-        elif self._n_updates and self._n_aux_skipped == self._n_updates:
-            self._warn_once("the auxiliary loss was never trained: no episode is as long as its horizon (%s)", self.aux_loss)
+        if self._n_updates and self._n_aux_skipped == self._n_updates:
+            message = f"the auxiliary loss was never trained: no episode is as long as its horizon ({self.aux_loss})"
+            warnings.warn(message, stacklevel=2)
         return self
-
-    def _warn_once(self, message: str, *args: Any) -> None:
-        if message not in self._warned:
-            logger.warning(message, *args)
-        self._warned.add(message)
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         with self._actor_checked():
@@ -581,28 +564,21 @@ class SACAux(SAC):
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
-        As in SB3. What belongs to an auxiliary loss that this model does not have is left out, and a loss that the
-        parameters do not fit starts untrained; both with a warning.
+        As in SB3. Parameters of another auxiliary loss than this model's are left out, with a warning.
         """
         given: Any = load_path_or_dict
         if not isinstance(given, dict):
             given = load_from_zip_file(given, device=device, load_data=False)[1]
-        own, auxiliary, problem = self.get_parameters(), {"aux_head", "aux_optimizer"}, None
-        if self.aux_head is None and auxiliary & given.keys():
-            problem = "an auxiliary loss, which this model does not have"
-        elif self.aux_head is not None and not auxiliary & given.keys() and exact_match:
-            problem = "no auxiliary loss: it starts untrained"
-        elif "aux_head" in own.keys() & given.keys() and _shapes(own["aux_head"]) != _shapes(given["aux_head"]):
-            problem = "another auxiliary loss or predictor: it starts untrained"
-        given = dict(given)
-        if problem:
-            logger.warning("the parameters are of a model with %s", problem)
+        own, auxiliary = self.get_parameters(), {"aux_head", "aux_optimizer"}
+        if _shapes(own.get("aux_head", {})) != _shapes(given.get("aux_head", {})):
+            message = "the parameters have another auxiliary loss, or none: that of this model (%s) stays as it is"
+            logger.warning(message, self.aux_loss)
             given = {name: value for name, value in given.items() if name not in auxiliary}
             given |= {name: own[name] for name in auxiliary & own.keys()}
         key = "critic.optimizer"
-        if key in given and len(given[key]["param_groups"][0]["params"]) != len(own[key]["param_groups"][0]["params"]):
+        if _n_parameters(given.get(key, {})) not in (0, _n_parameters(own[key])):
             # With aux_kwargs=dict(joint=True) the auxiliary optimizer has the encoder's part of the state.
-            given[key] = own[key]
+            given = {**given, key: own[key]}
         super().set_parameters(given, exact_match, device)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -496,14 +496,13 @@ def test_logs() -> None:
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_a_horizon_longer_than_any_episode_is_skipped_and_counted(joint: bool, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_horizon_longer_than_any_episode_is_skipped_and_counted(joint: bool) -> None:
     model = make_model(env=make_env("state", length=4), aux_loss="{s_t} -> {s_t+5}", aux_kwargs={"joint": joint})
     before = copy.deepcopy(model.aux_head.state_dict())
     encoder = copy.deepcopy(model.critic.features_extractor.state_dict())
-    model.learn(50, log_interval=1000)
+    with pytest.warns(UserWarning, match=r"never trained: no episode is as long as its horizon \(\{s_t\} -> \{s_t\+5\}\)"):
+        model.learn(50, log_interval=1000)
     assert model.logger.name_to_value["train/aux_skipped"] == model._n_updates == 30
-    messages = [record.getMessage() for record in caplog.records]
-    assert messages == ["the auxiliary loss was never trained: no episode is as long as its horizon ({s_t} -> {s_t+5})"]
     assert "train/aux_loss" not in model.logger.name_to_value
     assert_same(dict(model.aux_head.state_dict()), before)
     assert all(not th.equal(value, encoder[name]) for name, value in model.critic.features_extractor.state_dict().items())
@@ -521,14 +520,6 @@ def test_defaults_that_depend_on_run_and_actions() -> None:
     assert (model.learning_starts, model._n_updates) == (6, 54)  # a tenth of a short run
     assert default_learning_starts(10**6) == 5000
     assert model.target_entropy == -1.0  # half of SAC's, which is -2 for two actions
-
-
-def test_a_run_that_learns_nothing_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
-    model = make_model(learning_starts=50)
-    for _ in range(3):
-        model.learn(1, reset_num_timesteps=False)
-    make_model(gradient_steps=0).learn(50)  # asked for
-    assert [record.getMessage() for record in caplog.records] == ["nothing was learnt: learning starts after 50 agent steps"]
 
 
 # --- Save and load -----------------------------------------------------------------------------------------------------
@@ -621,8 +612,8 @@ def test_parameters_include_the_auxiliary_ones(joint: bool) -> None:
     assert fresh.aux_optimizer.state_dict()["state"] == {}
     fresh.set_parameters(parameters)
     assert_same(fresh.get_parameters(), parameters)
-    del parameters["aux_head"]
-    with pytest.raises(ValueError, match="aux_head"):
+    del parameters["policy"]
+    with pytest.raises(ValueError, match="policy"):
         fresh.set_parameters(parameters)
 
 
@@ -630,8 +621,7 @@ def test_parameters_include_the_auxiliary_ones(joint: bool) -> None:
 def test_loading_without_the_loss_or_with_one(joint: bool, tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
     """Back to plain SAC after pre-training, the other way round, another loss: all but it is loaded, with a warning."""
     other = "{s_t} -> {r_t} [bilinear, negatives]"
-    texts = {(LOSS, None): "which this model does not have", (None, LOSS): "it starts untrained", (LOSS, other): "another"}
-    for (before, after), text in texts.items():
+    for before, after in ((LOSS, None), (None, LOSS), (LOSS, other)):
         trained = make_model(aux_loss=before, aux_kwargs={"joint": joint}).learn(40)
         trained.save(tmp_path / "model")
         # Whether one optimizer trains both may change, too.
@@ -642,7 +632,8 @@ def test_loading_without_the_loss_or_with_one(joint: bool, tmp_path: pathlib.Pat
             assert_same(dict(model.policy.state_dict()), dict(trained.policy.state_dict()))
             model.learn(30)
         messages = [record.getMessage() for record in caplog.records]
-        assert len(messages) == 2 and all(text in message for message in messages)
+        kept = f"that of this model ({given.aux_loss}) stays as it is"
+        assert len(messages) == 2 and all(kept in message for message in messages)
         caplog.clear()
 
 
