@@ -55,8 +55,9 @@ def q_network(norm: str | None, inputs: int, net_arch: list[int], activation_fn:
         raise ValueError(f"unknown critic_norm {norm!r}, expected one of {', '.join(map(str, CRITIC_NORMS))}")
     layers = create_mlp(inputs, 1, net_arch, activation_fn, post_linear_modules=[nn.LayerNorm] if norm == "layer" else [])
     if norm == "batch":
-        for position in [i for i, layer in enumerate(layers) if isinstance(layer, nn.Linear)][::-1]:
-            normalization = nn.BatchNorm1d(layers[position].in_features, eps=1e-3, momentum=0.01)
-            normalization.num_batches_tracked = th.tensor(0.0)  # a float, as all that SB3's tools expect among parameters
-            layers.insert(position, normalization)
+        for position, layer in reversed(list(enumerate(layers))):
+            if isinstance(layer, nn.Linear):
+                normalization = nn.BatchNorm1d(layer.in_features, eps=1e-3, momentum=0.01)
+                normalization.num_batches_tracked = th.tensor(0.0)  # a float, as all that SB3's tools expect among parameters
+                layers.insert(position, normalization)
     return nn.Sequential(*layers)
