@@ -54,7 +54,7 @@ EMULATED: dict[str, Callable[[int, list[AuxLoss]], optuna.samplers.BaseSampler]]
     "ours, again": lambda seed, given: AuxLossSampler(seed=seed, initial=given, **FIRST, **OURS, again=0.2),
 }
 FIRST: dict[str, Any] = {"n_random": 20, "n_prior": 4}
-OURS: dict[str, Any] = {"population_size": 12, "screening": 32, "parent_selection": "posterior"}
+OURS: dict[str, Any] = {"population_size": 12, "screening": 32, "climbing": 30, "parent_selection": "posterior"}
 SEARCH_RUNS, RACE_RUNS, FINALISTS = 150, 60, 10
 
 

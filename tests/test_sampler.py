@@ -122,8 +122,13 @@ def reference(settings: dict[str, Any], sign: float) -> list[list[Row]]:
                 with contextlib.suppress(ValueError):
                     candidate = offspring(rng, operation, slot, parents, settings["max_horizon"])
                     drawn += [candidate] * (candidate[0].canonical() not in seen)
-            best = 0 if len(drawn) == 1 else choice(rng, known, [loss for loss, _ in drawn], settings["max_horizon"], sign)
-            loss, mothers = drawn[best]
+            loss, mothers = drawn[0]
+            if known and settings["screening"] > 1:
+                model = fitted(known, settings["max_horizon"], sign)
+                loss, mothers = drawn[int(np.argmax(model.draw([loss for loss, _ in drawn], rng, own=False)))]
+                optimism = abs(rng.standard_normal())
+                for _ in range(settings["climbing"]):
+                    loss = next((other for other in model.higher(loss, optimism) if other not in seen), loss)
             seen.add(loss.canonical())
             generation.append((loss, operation, [(number - 1, mother) for mother in mothers]))
         population = [(sign * score(loss), slot, loss) for slot, (loss, _, _) in enumerate(generation)]
@@ -150,20 +155,22 @@ def offspring(
     return mutations.crossover(loss, other, rng), [mother, father]
 
 
-def choice(rng: np.random.Generator, known: Any, losses: list[AuxLoss], max_horizon: int, sign: float) -> int:
-    """The offspring that one draw from the posterior after all generations rates highest."""
-    rows = [loss for generation in known for loss, _, _ in generation]
+def fitted(known: list[list[Row]], max_horizon: int, sign: float) -> TokenModel:
+    losses = [loss for generation in known for loss, _, _ in generation]
     model = TokenModel(max_horizon)
-    model.add(rows, [sign * score(loss) for loss in rows])
-    return int(np.argmax(model.draw(losses, rng, own=False)))
+    model.add(losses, [sign * score(loss) for loss in losses])
+    return model
 
 
-@pytest.mark.parametrize("screening", [1, 4])
+@pytest.mark.parametrize(("screening", "climbing"), [(1, 0), (4, 0), (4, 3)])
 @pytest.mark.parametrize("direction", ["maximize", "minimize"])
-def test_a_search_is_the_evolution_of_the_design(direction: Literal["maximize", "minimize"], screening: int) -> None:
+def test_a_search_is_the_evolution_of_the_design(
+    direction: Literal["maximize", "minimize"], screening: int, climbing: int
+) -> None:
     settings = {"population_size": 20, "n_random": 40, "n_prior": 9, "max_horizon": 6, "n_generations": 3, "seed": 5}
-    study = run(make_study(direction, **settings, screening=screening))
-    expected = reference({**settings, "screening": screening}, 1.0 if direction == "maximize" else -1.0)
+    settings |= {"screening": screening, "climbing": climbing}
+    study = run(make_study(direction, **settings))
+    expected = reference(settings, 1.0 if direction == "maximize" else -1.0)
     assert filled_slots(study) == all_slots(49, 20, 3)
     slot_of = {trial.number: key_of(trial)[:2] for trial in study.trials}
     for trial in study.trials:
@@ -260,7 +267,11 @@ def simulate(seed: int, n_running: int, **settings: Any) -> optuna.Study:
     return study
 
 
-SIMULATED: list[dict[str, Any]] = [{}, {"screening": 3}, {"again": 0.3, "parent_selection": "posterior", "screening": 2}]
+SIMULATED: list[dict[str, Any]] = [
+    {},
+    {"screening": 3},
+    {"again": 0.3, "parent_selection": "posterior", "screening": 2, "climbing": 3},
+]
 
 
 @cache
@@ -693,6 +704,7 @@ def test_pruners_work(pruner: optuna.pruners.BasePruner) -> None:
 OTHER_SETTINGS = {
     "population_size": 13, "n_random": 9, "n_prior": 3, "parents": 0.5, "max_horizon": 3, "operators": ("mse", "inner"),
     "allow_duplicates": True, "screening": 2, "initial": [WANTED], "again": 0.5, "parent_selection": "posterior",
+    "climbing": 1,
 }  # fmt: skip
 
 
@@ -707,7 +719,7 @@ def test_a_study_does_not_resume_with_other_settings(name: str, value: Any) -> N
     # One of an older version, which had fewer settings.
     stored = {key: value for key, value in AuxLossSampler.stored_settings(study).items() if key != name}
     study._storage.set_study_system_attr(study._study_id, SETTINGS_KEY, stored)
-    if name in ("again", "parent_selection"):
+    if name in ("again", "parent_selection", "climbing"):
         make_study(storage=study._storage).ask()
 
 

@@ -1,6 +1,7 @@
 """The model of screening, of parents and of losses that run again."""
 
 import sys
+from itertools import product
 
 import numpy as np
 import pytest
@@ -68,6 +69,26 @@ def test_the_posterior_is_that_of_all_runs_under_the_most_probable_variances() -
     draws = np.array([model.draw(queries[:8], rng) for _ in range(10_000)])
     np.testing.assert_allclose(draws.mean(axis=0), mean[:8], atol=2)
     np.testing.assert_allclose(np.cov(draws.T), found_covariance[:8, :8], atol=50)
+
+
+def test_higher_losses_are_all_with_one_token_more_or_less_whose_bound_is_higher_the_best_first() -> None:
+    losses, scores = runs(40, max_horizon=4)
+    model = fitted(losses, scores, max_horizon=4)
+
+    def bound(loss: AuxLoss) -> float:
+        mean, covariance = model.posterior([loss], own=False)
+        return float(mean[0] + 1.5 * np.sqrt(covariance[0, 0]))
+
+    for loss in {loss.canonical() for loss in losses}:
+        near = []
+        for flip in product(range(2), range(13)):
+            masks = np.zeros((2, 13), dtype=bool)
+            masks[:, : 3 * loss.horizon + 1] = loss.source, loss.target
+            masks[flip] ^= True
+            if masks[0, ::3].any() and masks[1].any() and masks[:, :3].any():
+                near.append(AuxLoss(4, *masks.tolist(), loss.operator, loss.negatives).canonical())
+        expected = [other for other in near if bound(other) > bound(loss)]
+        assert list(model.higher(loss, 1.5)) == sorted(expected, key=bound, reverse=True)
 
 
 @pytest.mark.parametrize("noise", [5.0, 80.0])

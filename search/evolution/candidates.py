@@ -44,6 +44,7 @@ class Settings:
     initial: Sequence[AuxLoss] = ()
     parent_selection: ParentSelection = "best"
     again: float = 0.0
+    climbing: int = 0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -62,7 +63,7 @@ class Settings:
 
     def _check_arguments(self, shares: dict[str, float]) -> None:
         least = dict.fromkeys(("population_size", "max_horizon", "screening", "n_generations"), 1)
-        least |= dict.fromkeys((*shares, "n_random", "n_prior", "seed", "again"), 0)
+        least |= dict.fromkeys((*shares, "climbing", "n_random", "n_prior", "seed", "again"), 0)
         for name, low in least.items():
             if (number := getattr(self, name)) is not None and not number >= low:
                 raise ValueError(f"{name} must be at least {low}, not {number}")
@@ -154,7 +155,7 @@ class Candidates:
         for result in scored:
             self.known.setdefault(result.loss.canonical(), result)
         settings, ratings, of_whom = self.settings, [result.score for result in scored], scored
-        if settings.screening > 1 or settings.again or settings.parent_selection == "posterior":
+        if settings.screening > 1 or settings.climbing or settings.again or settings.parent_selection == "posterior":
             self.model.add([result.loss for result in scored], ratings)
         if settings.parent_selection == "posterior" and self.known:
             of_whom = list(self.known.values())
@@ -196,14 +197,25 @@ class Candidates:
             operation = "replacement"
         # What replaces a failed random loss must not depend on whether the model knows another generation by then.
         is_early = attempt > 0 and operation == "random"
-        if self.settings.screening == 1 or not self.known or is_early:
+        if not (self.settings.screening > 1 or self.settings.climbing) or not self.known or is_early:
             return self._draw_new(rng, operation, slot, is_known)
         offspring: list[Candidate] = []
         for _ in range(self.settings.screening):
             offspring.append(self._draw_new(rng, operation, slot, is_known))
             operation = offspring[-1].operation  # that of a crossover that is not possible is another one
         ratings = self.model.draw([candidate.loss for candidate in offspring], rng, own=False)
-        return offspring[int(np.argmax(ratings))]
+        best = offspring[int(np.argmax(ratings))]
+        return best._replace(loss=self._climb(best.loss, abs(rng.standard_normal()), is_known))
+
+    def _climb(self, loss: AuxLoss, optimism: float, is_known: IsKnown) -> AuxLoss:
+        """Step by step to the one with one token more or less, of those that are new, which the model rates highest."""
+        for _ in range(self.settings.climbing):
+            higher = self.model.higher(loss, optimism)
+            better = next((other for other in higher if self.settings.allow_duplicates or not is_known(other)), None)
+            if better is None:
+                break
+            loss = better
+        return loss
 
     def _again(self, rng: np.random.Generator) -> Candidate:
         """Thompson sampling: the loss that one draw from the posterior of all losses rates highest, with its next seed."""

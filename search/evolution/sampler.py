@@ -84,6 +84,8 @@ class AuxLossSampler(Settings, BaseSampler):
         of all generations whose posterior mean, which a Gaussian process of the tokens has of them, is highest
     :param again: Share of the slots of later generations, 0 for the paper's evolution, that train a known loss with another
         seed (:meth:`seed_index`): by Thompson sampling, one that could be the best. The other shares divide the rest
+    :param climbing: At most so many tokens are added to the offspring of a slot or removed, 0 for the paper's evolution: each
+        time the one that most raises the model's mean and a multiple, drawn for each slot, of its deviation
     :param independent_sampler: For parameters beside those of the loss, instead of inheritance
     :raises ValueError: naming the argument that does not fit
     """

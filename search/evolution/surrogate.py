@@ -1,9 +1,9 @@
 """A Gaussian process over losses: what is known of a loss from its own runs, and from those of losses with similar tokens."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.spatial.distance import cdist
 from threadpoolctl import ThreadpoolController
 
@@ -30,9 +30,13 @@ def features(losses: Sequence[AuxLoss], max_horizon: int) -> np.ndarray:
     masks = np.zeros((len(losses), 2, 3 * max_horizon + 1))
     for mask, loss in zip(masks, losses, strict=True):
         mask[:, : 3 * loss.horizon + 1] = loss.source, loss.target
-    masks *= 0.8 ** (np.arange(3 * max_horizon + 1) // 3 / 2)
+    masks *= _decay(max_horizon)
     operators = [[*(np.sqrt(0.5) * (loss.operator == name) for name in OPERATORS), loss.negatives] for loss in losses]
     return np.hstack([masks.reshape(len(losses), -1), np.array(operators, dtype=float)])
+
+
+def _decay(max_horizon: int) -> np.ndarray:
+    return 0.8 ** (np.arange(3 * max_horizon + 1) // 3 / 2)
 
 
 class TokenModel:
@@ -101,6 +105,27 @@ class TokenModel:
         mean, covariance = self.posterior(losses, own)
         covariance += 1e-6 * self.variance * np.eye(len(mean))  # losses may be almost alike
         return mean + np.linalg.cholesky(covariance) @ rng.standard_normal(len(mean))
+
+    @one_thread
+    def higher(self, loss: AuxLoss, optimism: float) -> Iterator[AuxLoss]:
+        """
+        The losses with one token more or less, and some in the first step, that are rated higher, the best first. A rating
+        is the mean of the posterior and ``optimism`` times its deviation, without the part of each loss alone.
+        """
+        point = features([loss], self.max_horizon)
+        tokens = (point[0, : -len(OPERATORS) - 1] > 0).reshape(2, -1)
+        flips = np.eye(tokens.size, dtype=bool).reshape(-1, *tokens.shape)
+        masks = tokens ^ np.concatenate([np.zeros_like(flips[:1]), flips])
+        is_valid = masks[:, 0, ::3].any(axis=1) & masks[:, 1].any(axis=1) & masks[:, :, :3].any(axis=(1, 2))
+        masks = masks[is_valid]
+        points = np.repeat(point, len(masks), axis=0)
+        points[:, : tokens.size] = (masks * _decay(self.max_horizon)).reshape(len(masks), -1)
+        to_known = self._kernel(cdist(points, self._points, "sqeuclidean"), own=False)
+        known = solve_triangular(self._factor[0], to_known.T, lower=True)
+        deviation = np.sqrt(self.variance * (self.shares[0] - (known**2).sum(axis=0)).clip(0))
+        ratings = to_known @ self._weights + optimism * deviation
+        order = np.argsort(-ratings, kind="stable")[: (ratings > ratings[0]).sum()]
+        return (AuxLoss(self.max_horizon, *m, loss.operator, loss.negatives).canonical() for m in masks[order].tolist())
 
     def rating(self, loss: AuxLoss) -> float:
         """The mean of the posterior of a loss."""
