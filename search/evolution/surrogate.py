@@ -113,13 +113,13 @@ class TokenModel:
         is the mean of the posterior and ``optimism`` times its deviation, without the part of each loss alone.
         """
         point = features([loss], self.max_horizon)
-        tokens = (point[0, : -len(OPERATORS) - 1] > 0).reshape(2, -1)
-        flips = np.eye(tokens.size, dtype=bool).reshape(-1, *tokens.shape)
-        masks = tokens ^ np.concatenate([np.zeros_like(flips[:1]), flips])
+        tokens = point[0, : -len(OPERATORS) - 1] > 0
+        masks = tokens ^ np.eye(len(tokens) + 1, len(tokens), -1, dtype=bool)  # the loss itself, and all flips of one token
+        masks = masks.reshape(-1, 2, len(tokens) // 2)
         is_valid = masks[:, 0, ::3].any(axis=1) & masks[:, 1].any(axis=1) & masks[:, :, :3].any(axis=(1, 2))
         masks = masks[is_valid]
         points = np.repeat(point, len(masks), axis=0)
-        points[:, : tokens.size] = (masks * _decay(self.max_horizon)).reshape(len(masks), -1)
+        points[:, : len(tokens)] = (masks * _decay(self.max_horizon)).reshape(len(masks), -1)
         to_known = self._kernel(cdist(points, self._points, "sqeuclidean"), own=False)
         known = solve_triangular(self._factor[0], to_known.T, lower=True)
         deviation = np.sqrt(self.variance * (self.shares[0] - (known**2).sum(axis=0)).clip(0))
