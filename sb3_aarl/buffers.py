@@ -323,9 +323,10 @@ class WindowReplayBuffer(ReplayBuffer):
         self, batch_inds: np.ndarray, env: VecNormalize | None = None, crop_size: int | None = None
     ) -> ReplayBufferSamples | DictReplayBufferSamples:
         indices = batch_inds * self.n_envs + np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
-        last, rewards, discounts = indices, self._normalize_reward(self._take("rewards", indices)[:, None], env), None
         if self.n_steps > 1:
             last, rewards, discounts = self._n_step_returns(indices, env)
+        else:
+            last, rewards, discounts = indices, self._normalize_reward(self._take("rewards", indices)[:, None], env), None
         # Observations and next ones together.
         both = self.gather(np.stack([indices, last]), np.array([[False], [True]]), env, crop_size)
         dones = self._take("dones", last) * (1 - self._take("timeouts", last))
@@ -345,7 +346,7 @@ class WindowReplayBuffer(ReplayBuffer):
         """
         steps = np.arange(self.n_steps)
         every = (indices[:, None] + steps * self.n_envs) % self.ages.size
-        over = (self._take("dones", every) > 0) | (self._take("timeouts", every) > 0)
+        over = self._take("dones", every) + self._take("timeouts", every) > 0
         over |= every // self.n_envs == (self.pos - 1) % self.buffer_size
         over[:, -1] = True
         n_more = over.argmax(axis=1)
