@@ -212,10 +212,10 @@ def _tokens(words: str, text: str) -> list[Token]:
     for word in words.split(",") if words else []:
         match = _TOKEN.fullmatch(word)
         if match is None:
-            raise ValueError(f"{word!r} is no token such as s_t, a_t+1 or r_t+2: {text!r}")
+            raise ValueError(f"{word!r} is not a token such as s_t, a_t+1 or r_t+2: {text!r}")
         token = Token(match[1], int(match[2] or 0))
         if token in tokens:
-            raise ValueError(f"{token} is there twice: {text!r}")
+            raise ValueError(f"{token} appears twice: {text!r}")
         tokens.append(token)
     return tokens
 
@@ -227,6 +227,6 @@ def _options(words: str, text: str) -> dict[str, Any]:
         horizon = re.fullmatch(r"horizon=([0-9]{1,4})", word)
         key = "operator" if word in OPERATORS else "horizon" if horizon else word
         if key not in ("operator", "negatives", "horizon") or key in options:
-            raise ValueError(f"{word!r} is none of {', '.join(OPERATORS)}, negatives, horizon=k, each once only: {text!r}")
+            raise ValueError(f"{word!r} is none of {', '.join(OPERATORS)}, negatives, horizon=k, each at most once: {text!r}")
         options[key] = int(horizon[1]) if horizon else word if key == "operator" else True
     return options

@@ -223,7 +223,7 @@ class WindowReplayBuffer(ReplayBuffer):
                 self._store_whole(key)
                 size = self.stores[key].frames.nbytes / 1e9
                 warnings.warn(
-                    f"{problem}. The stack was detected, not asked for: whole observations are stored instead, which takes "
+                    f"{problem}. The stack was inferred from the wrappers: whole observations are stored instead, which takes "
                     f"{store.stack} times the memory, {size:.2g} GB in a full replay buffer. {STACK_ADVICE}",
                     stacklevel=2,
                 )

@@ -208,7 +208,7 @@ class SACAux(SAC):
             self._aux = AuxOptions(**(self.aux_kwargs or {}))
         except TypeError as error:
             known = ", ".join(AuxOptions.__dataclass_fields__)
-            raise ValueError(f"aux_kwargs: {str(error).partition(' got ')[2]}, expected some of {known}") from None
+            raise ValueError(f"aux_kwargs: {str(error).partition(' got ')[2]}; known: {known}") from None
         self._check_arguments()
         if isinstance(self.target_entropy, str) and self.target_entropy.startswith("auto_"):
             share = float(self.target_entropy.removeprefix("auto_"))
@@ -564,7 +564,7 @@ class SACAux(SAC):
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
-        As in SB3. Parameters of another auxiliary loss than this model's are left out, with a warning.
+        As in SB3. Parameters of an auxiliary loss whose shapes are not those of this model's are left out, with a warning.
         """
         given: Any = load_path_or_dict
         if not isinstance(given, dict):

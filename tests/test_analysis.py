@@ -125,7 +125,7 @@ def test_patterns_in_notation_and_by_name(planted):
     assert result["n_with"]["two rewards"] == n_with > 0
     with pytest.raises(ValueError, match="forward-dynamic"):
         analysis.table5(table, {"typo": "forward-dynamcs"})
-    with pytest.raises(ValueError, match="is no token"):
+    with pytest.raises(ValueError, match="is not a token"):
         analysis.table5(table, {"typo": "{s_t} -> {q_t}"})
 
 

@@ -94,7 +94,7 @@ def test_train_shows_the_curve_and_keeps_the_model(folder: Path) -> None:
         (["cartpole-blance"], "nearest: cartpole-balance"),
         (["Own-v0"], "Imports (--imports, or imports: in the file) register your own"),
         (["Pendulum-v1", "--aux-loss", "curll"], "nearest: curl"),
-        (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "'q_t' is no token"),
+        (["Pendulum-v1", "--aux-loss", "{s_t} -> {q_t}"], "'q_t' is not a token"),
         (["Pendulum-v1"], "how many steps"),
         (["Pendulum-v1", "--steps", "3", "--evaluations", "5"], "too few"),
         (["Pendulum-v1", "--hyperparams", "sac_pixl"], "nearest: sac_pixel"),

@@ -361,7 +361,7 @@ def test_an_environment_without_an_entry_is_named(tmp_path: Path) -> None:
         ("a: [1", "line 1"),
         ("a: 1\nb: {c: 2\nd: 3", "line 3"),
         ("a: 1\n b: 2", "line 2"),
-        ("a: 1\nb: {c: 1, c: 2}", "line 2: 'c' is there twice"),
+        ("a: 1\nb: {c: 1, c: 2}", "line 2: 'c' appears twice"),
         ("a: &x {b: 1}\n<<: *x\n<<: *x", None),
         ("a: &x {b: 1, c: 1}\nd: {<<: *x, b: 2}", None),  # a merge is overwritten, as YAML has it
         ("", "must hold a mapping"),

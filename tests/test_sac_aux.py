@@ -746,7 +746,7 @@ def test_augmentation_is_saved(argument: dict[str, Any], tmp_path: pathlib.Path)
     ("kind", "settings", "message"),
     [
         ("state", {"aux_loss": "forward-dynamic"}, r"forward-dynamic'.*nearest: forward-dynamics"),
-        ("state", {"aux_loss": "{s_t, b_t} -> {s_t+1}"}, "'b_t' is no token"),
+        ("state", {"aux_loss": "{s_t, b_t} -> {s_t+1}"}, "'b_t' is not a token"),
         ("state", {"aux_loss": "{a_t} -> {s_t+1}"}, r"source needs at least one state"),
         ("state", {"aux_loss": "{s_t} -> {}"}, r"target is empty"),
         ("state", {"aux_loss": 3}, r"an auxiliary loss is .*not 3"),
