@@ -253,6 +253,7 @@ class MultiInputEncoder(Encoder):
         normalized_image: bool = False,
         vector_encoder: str = "simba",
     ):
+        assert isinstance(observation_space, spaces.Dict), f"MultiInputPolicy is for Dict spaces, not for {observation_space}"
         images = image_spaces(observation_space, normalized_image)
         vectors = {key: space for key, space in observation_space.spaces.items() if key not in images}
         encoders: list[Encoder] = [PixelEncoder(space, cnn_output_dim) for space in images.values()]

@@ -82,7 +82,7 @@ class SACAux(SAC):
     :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. If one that
         was detected does not hold, a warning is raised and whole observations are stored
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
-    :param n_steps: Steps of n-step returns
+    :param n_steps: Steps of n-step returns; None (default) for 3, and for 1 with a buffer that is no WindowReplayBuffer
     :param ent_coef: As in SB3; ``"auto_0.01"`` (default) learns it from 0.01 on
     :param target_entropy: As in SB3; ``"auto_0.5"`` (default) is half of what ``"auto"`` is
     :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
@@ -132,7 +132,7 @@ class SACAux(SAC):
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: int = 3,
+        n_steps: int | None = None,
         ent_coef: str | float = "auto_0.01",
         target_update_interval: int = 1,
         target_entropy: str | float = "auto_0.5",
@@ -168,7 +168,7 @@ class SACAux(SAC):
             replay_buffer_class,
             replay_buffer_kwargs,
             optimize_memory_usage,
-            n_steps,
+            n_steps,  # type: ignore[arg-type]
             ent_coef,
             target_update_interval,
             target_entropy,
@@ -208,13 +208,15 @@ class SACAux(SAC):
             self._aux = AuxOptions(**(self.aux_kwargs or {}))
         except TypeError as error:
             known = ", ".join(AuxOptions.__dataclass_fields__)
-            raise ValueError(f"aux_kwargs: {str(error).partition(' got ')[2]}; known: {known}") from None
+            raise ValueError(f"aux_kwargs: {str(error).rpartition(' got ')[2]}; known: {known}") from None
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = WindowReplayBuffer
+        if self.n_steps is None:
+            self.n_steps = 3 if issubclass(self.replay_buffer_class, WindowReplayBuffer) else 1
         self._check_arguments()
         if isinstance(self.target_entropy, str) and self.target_entropy.startswith("auto_"):
             share = float(self.target_entropy.removeprefix("auto_"))
             self.target_entropy = -share * get_action_dim(self.action_space)
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = WindowReplayBuffer
         with warnings.catch_warnings():
             if issubclass(self.replay_buffer_class, WindowReplayBuffer):
                 self._setup_replay_buffer(self.replay_buffer_class)
@@ -222,7 +224,9 @@ class SACAux(SAC):
                 warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
 
-        if self.ent_coef_optimizer is not None and self.ent_coef_optimizer_kwargs:
+        if self.ent_coef_optimizer_kwargs and self.ent_coef_optimizer is None:
+            logger.warning("ent_coef_optimizer_kwargs have no effect: ent_coef=%s is fixed", self.ent_coef)
+        elif self.ent_coef_optimizer_kwargs:
             assert self.log_ent_coef is not None
             kwargs = {"lr": self.lr_schedule(1), **self.ent_coef_optimizer_kwargs}
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], **kwargs)
@@ -235,9 +239,8 @@ class SACAux(SAC):
     def _setup_replay_buffer(self, buffer_class: type[WindowReplayBuffer]) -> None:
         if self.env is not None:
             self._frame_stack = detect_frame_stack(self.env)
-        kwargs = {"frame_stack": self._frame_stack, **(self.replay_buffer_kwargs or {})}
-        if self.n_steps > 1:
-            kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}
+        returns = {"n_steps": self.n_steps, "gamma": self.gamma} if self.n_steps > 1 else {}
+        kwargs = {"frame_stack": self._frame_stack, **returns, **(self.replay_buffer_kwargs or {})}
         space, actions, n_envs = self.observation_space, self.action_space, self.n_envs
         self.replay_buffer = buffer_class(self.buffer_size, space, actions, device=self.device, n_envs=n_envs, **kwargs)
         self.replay_buffer.frame_stack_detected = "frame_stack" not in (self.replay_buffer_kwargs or {})
@@ -248,7 +251,7 @@ class SACAux(SAC):
                 "policy must be MlpPolicy, CnnPolicy, MultiInputPolicy or derived from sb3_aarl.policies.SACAuxPolicy, "
                 f"not {self.policy_class}: SB3's have no momentum encoder"
             )
-        for name in ("buffer_size", "batch_size", "policy_delay", "target_update_interval"):
+        for name in ("buffer_size", "batch_size", "n_steps", "policy_delay", "target_update_interval"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         for name in ("tau", "gamma"):

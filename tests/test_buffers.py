@@ -881,6 +881,8 @@ def test_a_buffer_class_of_a_users_own_gets_stack_and_n_steps(buffer_class, recw
     assert {key: store.stack for key, store in buffer.stores.items()} == {"state": 2, "table": 1}
     assert (type(buffer), buffer.n_steps, buffer.gamma) == (buffer_class or WindowReplayBuffer, 3, 0.9)
     assert (len(np.unique(buffer.sample(30).rewards)) == 1) == (buffer_class is Mine)
+    own = small(SACAux, env, replay_buffer_class=buffer_class, replay_buffer_kwargs={"n_steps": 5})  # as SB3 advises
+    assert own.replay_buffer.n_steps == 5
     assert not recwarn
 
 

@@ -390,6 +390,8 @@ def test_environments_in_processes_are_the_same(tmp_path: Path) -> None:
         ({"policy_kwargs": {"features_extractor_class": "dens"}}, "Walk-v0 cannot be .*dense_mlp"),
         ({"replay_buffer_kwargs": {"frame": 2}}, "Walk-v0 cannot be trained .*frame"),
         ({"normalize": {"norm_obz": True}}, "Walk-v0 cannot be trained .*norm_obz"),
+        ({"env_wrapper": "gymnasium.wrappers.TimeLimit"}, "missing 1 required .*'max_episode_steps'"),
+        ({"policy": "MultiInputPolicy", "policy_kwargs": {}}, "MultiInputPolicy is for Dict spaces, not for Box"),
     ],
     ids=str,
 )

@@ -462,13 +462,15 @@ def test_which_loss_moves_the_encoder(kind: str, joint: bool) -> None:
     assert moved(1e-3, 0.0, aux_loss=None) == {"encoder", "q", "actor"}
 
 
-def test_learning_rates_and_coef() -> None:
+def test_learning_rates_and_coef(caplog: pytest.LogCaptureFixture) -> None:
     settings = {"learning_rate": 1e-3, "aux_kwargs": {"learning_rate": lambda left: 2e-3 * left}}
     model = make_model(ent_coef_optimizer_kwargs={"lr": 1e-2, "betas": (0.3, 0.99)}, **settings).learn(50)
     assert model.aux_optimizer.param_groups[0]["lr"] == pytest.approx(2e-3 * model._current_progress_remaining)
     assert model.ent_coef_optimizer.param_groups[0]["lr"] == 1e-2
     assert model.ent_coef_optimizer.param_groups[0]["betas"] == (0.3, 0.99)
     assert model.critic.optimizer.param_groups[0]["lr"] == 1e-3
+    make_model(ent_coef=0.1, ent_coef_optimizer_kwargs={"lr": 1e-2})
+    assert "ent_coef_optimizer_kwargs have no effect: ent_coef=0.1 is fixed" in caplog.text
     model = make_model(learning_rate=lambda left: 1e-3 + left).learn(10)
     assert model.ent_coef_optimizer.param_groups[0]["lr"] == model.actor.optimizer.param_groups[0]["lr"] > 1e-3
 
@@ -751,12 +753,13 @@ def test_augmentation_is_saved(argument: dict[str, Any], tmp_path: pathlib.Path)
         ("state", {"aux_loss": "{s_t} -> {}"}, r"target is empty"),
         ("state", {"aux_loss": 3}, r"an auxiliary loss is .*not 3"),
         ("state", {"policy_delay": 0}, r"policy_delay must be at least 1, not 0"),
-        ("state", {"batch_size": 0}, r"batch_size must be at least 1, not 0"),
+        ("state", {"n_steps": 0}, r"n_steps must be at least 1, not 0"),
         ("state", {"gamma": 5}, r"gamma must be between 0 and 1, not 5"),
         ("state", {"policy_kwargs": {"n_critics": 0}}, r"policy_kwargs: n_critics must be at least 1, not 0"),
         ("state", {"aux_kwargs": {"tau": 2}}, r"aux_kwargs: tau must be between 0 and 1, not 2"),
         ("state", {"aux_kwargs": {"predictor_width": 0}}, r"aux_kwargs: predictor_width must be at least 1, not 0"),
-        ("state", {"aux_kwargs": {"tua": 0.1}}, r"aux_kwargs: .*'tua'"),
+        ("state", {"aux_kwargs": {"tua": 0.1}}, r"aux_kwargs: an unexpected .*'tua'"),
+        ("state", {"aux_kwargs": {"tau": "0.1"}}, r"aux_kwargs: .* not supported .*'str'"),
         ("state", {"aux_kwargs": {"coef": math.nan}}, r"aux_kwargs: coef must be a finite number of at least 0, not nan"),
         ("state", {"aux_kwargs": {"coef": 2}}, r"aux_kwargs: coef has no effect without joint=True"),
         ("state", {"precision": "fp16"}, r"precision must be fp32 or bf16, not 'fp16'"),

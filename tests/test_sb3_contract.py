@@ -504,6 +504,7 @@ def test_callbacks(tmp_path: Any) -> None:
     assert_equal_parameters(best, checkpoint)
 
 
+@pytest.mark.filterwarnings("error:`n_steps")
 def test_her(caplog: pytest.LogCaptureFixture) -> None:
     kwargs: dict[str, Any] = {"replay_buffer_class": HerReplayBuffer, "buffer_size": 200, "learning_starts": 20}
     with pytest.raises(ValueError, match=r"HerReplayBuffer has no windows, .*pass aux_loss=None"):

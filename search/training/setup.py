@@ -97,7 +97,8 @@ class Setup:
         is_dmc = run.environment.startswith(PREFIX)
         limits = [EPISODE_LENGTH if is_dmc else gym.spec(run.environment).max_episode_steps]
         for wrapper, arguments in env_wrappers(self.env_wrapper):
-            limits += [arguments["max_episode_steps"] * self.action_repeat] if wrapper is gym.wrappers.TimeLimit else []
+            if wrapper is gym.wrappers.TimeLimit and "max_episode_steps" in arguments:
+                limits.append(arguments["max_episode_steps"] * self.action_repeat)
         self.episode_steps = min((limit for limit in limits if limit is not None), default=None)
 
     def _make(self, steps: Sequence[int] = ()) -> Callable[[], gym.Env]:
