@@ -156,6 +156,7 @@ def test_a_run_that_is_there_twice_is_refused(folder: Path) -> None:
     curves = read_curves(Path("out"))
     assert len(curves) == 8 and set(curves["env"]) == {ENV} and set(curves["environment_steps"]) == {200, 400}
     path = cell_folder(Path("out"), Cell("mine", ENV, 1))
+    assert ".." not in cell_folder(Path("out"), Cell("..", ENV, 1)).parts
     about = read_about(path)
     write_about(path, {**about, "seed": 0})
     with pytest.raises(ValueError, match=f"have the same run: mine on {ENV}, seed 0"):

@@ -263,14 +263,15 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"space": {"gamma": {"type": "float", "low": 0.9}}}, "space.gamma: must be a list of choices, or {type: .*not {"),
     ({"space": {"gamma": {"type": "float", "low": 0.9, "high": 0.8}}}, "space.gamma: .*low"),
     ({"space": {"gama": [0.9]}}, "space.gama: gama: unknown key, .*'gamma'"),
+    ({"space": {"aux_loss": ["curl"]}}, "space: aux_loss cannot be set"),
     ({"space": {"batch_size": [8, 0.5]}}, "space.batch_size: batch_size: should be a valid integer"),
     ({"baselines": [{"name": "a", "aux_los": None}]}, r"baselines\[0\].aux_los: .*'aux_loss'"),
     ({"baselines": [{"name": "a", "aux_loss": "curll"}]}, r"baselines\[0\].aux_loss: .*nearest: curl"),
     (
         {"baselines": [{"name": "a", "overrides": {"aux_loss": "curl"}}]},
-        r"baselines\[0\].overrides: aux_loss cannot be overridden",
+        r"baselines\[0\].overrides: aux_loss cannot be set",
     ),
-    ({"overrides": {"aux_loss": "curl"}}, "overrides: aux_loss cannot be overridden: a search finds losses"),
+    ({"overrides": {"aux_loss": "curl"}}, "overrides: aux_loss cannot be set: a search finds losses"),
     ({"baselines": [{"name": "a"}, {"name": "a"}]}, "baselines: must have at least one item, and none twice"),
     ({"initial": ["curll"]}, "initial: .*nearest: curl"),
     ({"initial": ["curl"]}, "mean squared error"),  # which is all that is searched without `operators`

@@ -107,6 +107,8 @@ def test_a_study_of_another_kind_is_refused_and_stays_as_it_is(config: SearchCon
 def test_a_search_from_python(config: SearchConfig, tmp_path: Path, executor: Planted) -> None:
     with pytest.raises(ConfigError, match=r"small.yml: Pendulum-v1 cannot be trained"):
         Search.from_file(config.path, overrides={"stats_window_size": -1})
+    with pytest.raises(ConfigError, match=r"space {'gamma': 2.0}: .* gamma must be between 0 and 1"):
+        Search.from_file(config.path, space={"gamma": {"type": "float", "low": 0.5, "high": 2.0}})
     search = Search.from_file(config.path, tmp_path / "mine", generations=1)
     assert not (tmp_path / "mine").exists()
     progresses: list[SearchProgress] = []

@@ -73,7 +73,7 @@ def scaled(score: float, returns: Sequence[float] | None) -> float:
 def cell_folder(folder: Path, cell: Cell) -> Path:
     """Where a run is: ``FOLDER/VARIANT/TASK/seed-N``."""
     variant = cell.variant
-    if not re.fullmatch(r"[\w.-]{1,80}", variant):  # such as a loss's notation
+    if not re.fullmatch(r"\w[\w.-]{,79}", variant):  # such as a loss's notation
         slug = re.sub(r"[^a-z0-9]+", "-", variant.lower()).strip("-")[:60]
         variant = f"{slug}-{hashlib.sha256(variant.encode()).hexdigest()[:8]}"
     return folder / variant / task_folder(cell.environment) / f"seed-{cell.seed}"

@@ -58,7 +58,7 @@ def _loss_or_none(value: Any) -> AuxLoss | None:
 
 def _without_loss(overrides: dict[str, Any]) -> dict[str, Any]:
     if "aux_loss" in overrides:
-        raise ValueError("aux_loss cannot be overridden: a search finds losses, and a baseline has its own key aux_loss")
+        raise ValueError("aux_loss cannot be set: a search finds losses, and a baseline has its own key aux_loss")
     return overrides
 
 
@@ -183,7 +183,7 @@ class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
     cross_validation: CrossValidation | None = None
     baselines: Annotated[tuple[Baseline, ...], AfterValidator(_different)] = ()
     overrides: Overrides = {}
-    space: dict[str, Annotated[Any, PlainValidator(_distribution)]] = {}
+    space: Annotated[dict[str, Annotated[Any, PlainValidator(_distribution)]], AfterValidator(_without_loss)] = {}
     # The file of hyper-parameters, read once, and checked hyper-parameters by environment and baseline.
     _file: dict[str, Any] = PrivateAttr(default_factory=dict)
     _checked: dict[tuple[str, str | None], dict[str, Any]] = PrivateAttr(default_factory=dict)
@@ -292,12 +292,17 @@ def load_config(path: str | Path, **changes: Any) -> SearchConfig:
             config.hyperparameters_for(env_id, baseline)
         if config.environments and config.returns_on(env_id) is None:
             raise ConfigError(f"{path}: cross_validation.returns: {env_id} is missing, with the returns that count as 0 and 1")
-    for name, distribution in config.space.items():
-        ends = getattr(distribution, "choices", None) or (distribution.low, distribution.high)
-        for env_id, value in product(config.tasks, ends):
-            values = merge_space(config.hyperparameters_for(env_id), {name: value})
+    for env_id, corner in product(config.tasks, corners(config.space)):
+        for name in corner:
+            values = merge_space(config.hyperparameters_for(env_id), {name: corner[name]})
             training.check_hyperparameters(values, env_id, f"{path}: space.{name}")
     return config
+
+
+def corners(space: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """As many values of all parameters together as have every choice, and both ends of every range, at least once."""
+    ends = {name: getattr(item, "choices", None) or (item.low, item.high) for name, item in space.items()}
+    return [{name: some[i % len(some)] for name, some in ends.items()} for i in range(max(map(len, ends.values()), default=1))]
 
 
 def merge_space(hyperparameters: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

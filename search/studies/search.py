@@ -21,7 +21,7 @@ from sb3_aarl.search.execution.driver import Driver, SearchProgress
 from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.matrix import Cell, Matrix
 from sb3_aarl.search.execution.storage import open_storage
-from sb3_aarl.search.studies.config import Baseline, SearchConfig, load_config, merge_space
+from sb3_aarl.search.studies.config import Baseline, SearchConfig, corners, load_config, merge_space
 from sb3_aarl.search.training.folder import FREE, Run, differences
 from sb3_aarl.search.training.setup import check_run
 
@@ -117,13 +117,15 @@ class Search:
         cls, path: str | Path, folder: Path | None = None, storage: BaseStorage | str | None = None, **changes: Any
     ) -> "Search":
         """
-        Read a configuration, and try out a run of a candidate. ``changes`` are values over those of the file.
+        Read a configuration, and try out runs of candidates. ``changes`` are values over those of the file.
 
         :raises ConfigError: naming the file, when it cannot be used, or no run can be trained
         """
         config = load_config(path, **changes)
-        for environment in config.tasks:
-            setup = check_run(make_run(config, environment, catalog.load("forward-dynamics"), config.seeds[0]), str(path))
+        for environment, values in product(config.tasks, corners(config.space)):
+            run = make_run(config, environment, catalog.load("forward-dynamics"), config.seeds[0])
+            run = run.model_copy(update={"hyperparameters": merge_space(run.hyperparameters, values)})
+            setup = check_run(run, f"{path}: space {values}" if values else str(path))
             if setup.episode_steps is not None and setup.episode_steps < (longest := config.max_horizon * setup.action_repeat):
                 message = "max_horizon is %d environment steps, episodes have %d: losses with longer horizons have no window"
                 logger.warning(message, longest, setup.episode_steps)
