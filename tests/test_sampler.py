@@ -529,6 +529,11 @@ def test_promising_losses_run_again_with_their_next_seeds() -> None:
     assert np.mean(repeated) > np.quantile([score(loss) for loss in seeds], 0.8)
 
 
+def test_scores_that_are_too_large_for_the_surrogate_choose_parents() -> None:
+    settings: dict[str, Any] = {"again": 0.3, "parent_selection": "posterior", "screening": 2, "n_generations": 2}
+    assert filled_slots(run(make_study(**settings), lambda loss: 1e200 * score(loss))) == all_slots(12, 12, 2)
+
+
 class Half(optuna.samplers.RandomSampler):
     """Not random at all."""
 

@@ -157,7 +157,7 @@ class Candidates:
         settings, ratings, of_whom = self.settings, [result.score for result in scored], scored
         if settings.screening > 1 or settings.climbing or settings.again or settings.parent_selection == "posterior":
             self.model.add([result.loss for result in scored], ratings)
-        if settings.parent_selection == "posterior" and self.known:
+        if settings.parent_selection == "posterior" and self.model.scores:
             of_whom = list(self.known.values())
             ratings = list(self.model.posterior([result.loss for result in of_whom])[0])
         n_parents = max(1, round(settings.parents * len(results)))
@@ -192,12 +192,12 @@ class Candidates:
         if operation == "given" and slot < len(operations) and attempt == 0:
             return Candidate(self.settings.initial[slot], operation)
         if operation == "again":
-            if slot < len(operations) and attempt == 0 and self.known:
+            if slot < len(operations) and attempt == 0 and self.model.scores:
                 return self._again(rng)
             operation = "replacement"
         # What replaces a failed random loss must not depend on whether the model knows another generation by then.
         is_early = attempt > 0 and operation == "random"
-        if not (self.settings.screening > 1 or self.settings.climbing) or not self.known or is_early:
+        if not (self.settings.screening > 1 or self.settings.climbing) or not self.model.scores or is_early:
             return self._draw_new(rng, operation, slot, is_known)
         offspring: list[Candidate] = []
         for _ in range(self.settings.screening):
