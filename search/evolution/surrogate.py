@@ -125,7 +125,10 @@ class TokenModel:
         deviation = np.sqrt(self.variance * (self.shares[0] - (known**2).sum(axis=0)).clip(0))
         ratings = to_known @ self._weights + optimism * deviation
         order = np.argsort(-ratings, kind="stable")[: (ratings > ratings[0]).sum()]
-        return (AuxLoss(self.max_horizon, *m, loss.operator, loss.negatives).canonical() for m in masks[order].tolist())
+        return (
+            AuxLoss(self.max_horizon, source, target, loss.operator, loss.negatives).canonical()
+            for source, target in masks[order].tolist()
+        )
 
     def rating(self, loss: AuxLoss) -> float:
         """The mean of the posterior of a loss."""
