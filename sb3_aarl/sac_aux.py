@@ -48,10 +48,6 @@ def _shapes(parameters: Mapping[str, th.Tensor]) -> dict[str, th.Size]:
     return {name: value.shape for name, value in parameters.items()}
 
 
-def _n_parameters(optimizer: Mapping[str, Any]) -> int:
-    return sum(len(group["params"]) for group in optimizer.get("param_groups", []))
-
-
 def default_learning_starts(total_timesteps: int) -> int:
     """Agent steps with random actions in a run of ``total_timesteps``, unless ``learning_starts`` says how many."""
     return min(5000, total_timesteps // 10)
@@ -372,7 +368,7 @@ class SACAux(SAC):
                 if self._n_updates % self.target_update_interval == 0:
                     self._update_target()
                 # Running statistics of the encoder are copied, see SB3's issue 996.
-                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+                polyak_update(self.critic.running_statistics, self.critic_target.running_statistics, 1.0)
 
     def _act(self, observations: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
         """Actions of the actor and their log probabilities, (batch, action_dim) and (batch, 1)."""
@@ -574,12 +570,12 @@ class SACAux(SAC):
             given = load_from_zip_file(given, device=device, load_data=False)[1]
         own, auxiliary = self.get_parameters(), {"aux_head", "aux_optimizer"}
         if _shapes(own.get("aux_head", {})) != _shapes(given.get("aux_head", {})):
-            message = "the parameters have another auxiliary loss, or none: that of this model (%s) stays as it is"
-            logger.warning(message, self.aux_loss)
+            logger.warning("parameters of another aux_loss, or of none: that of this model (%s) stays as it is", self.aux_loss)
             given = {name: value for name, value in given.items() if name not in auxiliary}
             given |= {name: own[name] for name in auxiliary & own.keys()}
         key = "critic.optimizer"
-        if _n_parameters(given.get(key, {})) not in (0, _n_parameters(own[key])):
+        old, new = ([group["params"] for group in state[key]["param_groups"]] for state in (own | given, own))
+        if old != new:
             # With aux_kwargs=dict(joint=True) the auxiliary optimizer has the encoder's part of the state.
             given = {**given, key: own[key]}
         super().set_parameters(given, exact_match, device)
