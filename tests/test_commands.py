@@ -210,6 +210,9 @@ def test_status_of_a_study_made_in_python(sampler: BaseSampler) -> None:
     progress = re.search(r"generation 1: (\d+)/\d+ done, 0 running, (\d+) failed", shown)
     assert progress is not None and sum(map(int, progress.groups())) == len(study.trials)
     assert f"best {study.best_value:.2f}" in shown
+    optuna.create_study(storage=open_storage(Path("runs/two")), directions=["maximize", "minimize"], study_name="two")
+    for command in ("status", "report"):
+        assert "study 'two' has 2 objectives" in run(command, "runs/two", code=2)
 
 
 def test_status_of_a_benchmark(folder: Path) -> None:

@@ -31,7 +31,7 @@ def test_a_study_has_one_driver_in_whichever_folder(
     database: str, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    urls = ["sqlite:///all.db", f"sqlite:///{tmp_path}/all.db"]
+    urls = ["sqlite:///all.db", f"sqlite:///file:{tmp_path}/all.db?uri=true"]
     if database == "postgresql":
         postgres: Postgres = request.getfixturevalue("postgres")
         urls = [postgres.create("driven")] * 2

@@ -43,14 +43,17 @@ def open_storage(folder: Path | None, url: str | None = None, create: bool = Tru
 
 
 def load_study(storage: RDBStorage, name: str | None = None) -> optuna.Study:
-    """Load a study by its name, or the only one; a ValueError names those that are there."""
+    """Load a study of one objective by its name, or the only one; a ValueError names those that are there."""
     names = optuna.get_all_study_names(storage)
     if name is None and len(names) == 1:
         name = names[0]
     if name not in names:
         wanted = "which study?" if name is None else f"there is no study {name!r}."
         raise ValueError(f"{wanted} The storage has: {', '.join(names) or 'none'}")
-    return optuna.load_study(study_name=name, storage=storage)
+    study = optuna.load_study(study_name=name, storage=storage)
+    if len(study.directions) > 1:
+        raise ValueError(f"study {name!r} has {len(study.directions)} objectives, a search has one")
+    return study
 
 
 def cause(error: BaseException | None) -> str:
@@ -77,9 +80,12 @@ def driver_lock(storage: BaseStorage, study_name: str, folder: Path) -> Iterator
     """
     study_id, files = storage.get_study_id_from_name(study_name), [folder / LOCK]
     engine = storage.engine if isinstance(storage, RDBStorage) else None
-    if engine is not None and engine.name == "sqlite" and engine.url.database:
-        path = Path(engine.url.database).resolve()
-        files.append(path.with_name(f"{path.name}.{study_id}.lock"))
+    if engine is not None and engine.name == "sqlite":
+        with engine.connect() as connection:  # SQLite itself knows its file, of which a URL may be a URI
+            database = connection.scalar(text("SELECT file FROM pragma_database_list WHERE name = 'main'"))
+        if database:
+            path = Path(database).resolve()
+            files.append(path.with_name(f"{path.name}.{study_id}.lock"))
     with ExitStack() as stack:
         try:
             for path in files:
