@@ -351,6 +351,7 @@ def main() -> None:
     parser.add_argument("--emulated", action="store_true", help="landscapes like that of a real search")
     parser.add_argument("--evaluations", type=int, default=500)
     parser.add_argument("--seeds", type=int, default=20, help="or landscapes")
+    parser.add_argument("--first", type=int, default=0, help="the first of them")
     parser.add_argument("--objectives", nargs="+", default=list(OBJECTIVES), choices={**OBJECTIVES, **MORE})
     parser.add_argument("--samplers", nargs="+", choices={**SAMPLERS, **EMULATED})
     parser.add_argument("--processes", type=int, default=2)
@@ -361,11 +362,12 @@ def main() -> None:
     settings = {"emulated": args.emulated, "evaluations": SEARCH_RUNS + RACE_RUNS if args.emulated else args.evaluations}
     names: tuple[str, ...] = ("sampler", "landscape") if args.emulated else ("objective", "sampler", "seed")
     function: Callable[[Any], dict] = run_emulated if args.emulated else run
+    seeds = range(args.first, args.first + args.seeds)
     if args.emulated:
-        wanted: list[tuple] = [(name, seed) for seed in range(args.seeds) for name in args.samplers or EMULATED]
+        wanted: list[tuple] = [(name, seed) for seed in seeds for name in args.samplers or EMULATED]
     else:
         samplers = args.samplers or SAMPLERS
-        wanted = [(o, s, seed) for seed in range(args.seeds) for s in samplers for o in args.objectives]
+        wanted = [(o, s, seed) for seed in seeds for s in samplers for o in args.objectives]
     done: list[dict] = []
     if args.out and args.out.exists():
         before = json.loads(args.out.read_text())

@@ -23,7 +23,7 @@ ParentSelection = Literal["best", "posterior"]
 IsKnown = Callable[[AuxLoss], bool]  # whether the search has a canonical form already
 
 
-@dataclass(eq=False, repr=False)
+@dataclass(eq=False, repr=False, kw_only=True)
 class Settings:
     """What decides the candidates of a search; the arguments of ``AuxLossSampler``, where they are explained."""
 

@@ -41,7 +41,7 @@ class GenerationProgress(NamedTuple):
     failed: int
 
 
-@dataclass(eq=False, repr=False)
+@dataclass(eq=False, repr=False, kw_only=True)
 class AuxLossSampler(Settings, BaseSampler):
     """
     Evolution of auxiliary losses with the paper's mutations, for ``suggest_aux_loss``.
@@ -304,7 +304,7 @@ class _Slots:
             generation = int(min(self.candidates.generation, self.last))
             free = [(generation, self._size(generation) + number)]
             others = [other for other in self.unfinished if other != number]
-            why = f"running trials {others} hold the others" if generation == self.candidates.generation else "it is over"
+            why = f"running trials {others} occupy all slots" if generation == self.candidates.generation else "it is over"
             logger.warning("Trial %d gets an extra slot of generation %d: %s", number, generation, why)
         (generation, slot), attempt = free[0], self.failed[free[0]]
         key: dict[str, Any] = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
