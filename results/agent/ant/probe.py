@@ -22,6 +22,8 @@ LAYER_NORM = {
 }
 VARIANTS: dict[str, dict[str, Any]] = {
     "defaults": {},
+    "adam": {"policy_kwargs": {"optimizer_class": th.optim.Adam}},  # the defaults before the weight decay
+    "one_critic": {"policy_kwargs": {"n_critics": 1}},
     "one_step": {"n_steps": 1},
     "layer_norm": LAYER_NORM,
     "layer_norm_one_step": {**LAYER_NORM, "n_steps": 1},
