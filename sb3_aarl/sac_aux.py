@@ -553,7 +553,7 @@ class SACAux(SAC):
         self._q_value_check = QValueCheck(**state["q_value_check"])
 
     def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        replay_buffer = self.replay_buffer
+        replay_buffer = vars(self).get("replay_buffer")
         super().load_replay_buffer(path, truncate_last_traj)
         if self.aux_loss is not None and not isinstance(self.replay_buffer, WindowReplayBuffer):
             name, self.replay_buffer = type(self.replay_buffer).__name__, replay_buffer

@@ -20,10 +20,11 @@ LAYER_NORM = {
     "policy_delay": 2,
     "policy_kwargs": {"critic_norm": "layer", "optimizer_kwargs": {"betas": (0.9, 0.999)}},
 }
+DECAY: dict[str, Any] = {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.1}}
 VARIANTS: dict[str, dict[str, Any]] = {
     "defaults": {},
-    "adam": {"policy_kwargs": {"optimizer_class": th.optim.Adam}},  # the defaults before the weight decay
-    "one_critic": {"policy_kwargs": {"n_critics": 1}},
+    "decay": {"policy_kwargs": DECAY},
+    "decay_one_critic": {"policy_kwargs": {**DECAY, "n_critics": 1}},
     "one_step": {"n_steps": 1},
     "layer_norm": LAYER_NORM,
     "layer_norm_one_step": {**LAYER_NORM, "n_steps": 1},
