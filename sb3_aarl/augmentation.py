@@ -18,7 +18,7 @@ def _check_crop(images: th.Tensor, size: int) -> None:
 
 def cut(images: th.Tensor, numbers: th.Tensor, top: th.Tensor, left: th.Tensor, height: int, width: int) -> th.Tensor:
     """
-    Parts of images, (..., channels, height, width); several times faster than indexing with slices or lists.
+    Parts of images, (..., channels, height, width), without a copy of the images that they are cut from.
 
     :param images: (n, channels, rows, columns)
     :param numbers: Of the images, (...); first row and column ``top`` and ``left`` of each part broadcast to it

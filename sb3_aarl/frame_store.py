@@ -102,7 +102,7 @@ class FrameStore:
         frames = th.from_numpy(self.frames).flatten(0, 1)
         if crop_size is None:
             stacked = frames.index_select(0, numbers.flatten()).view(*numbers.shape, *self.frame_shape)
-        else:  # ten times as fast as a crop of gathered frames
+        else:  # 1.6 to 4 times as fast as a crop of gathered frames
             top, left = (th.randint(length - crop_size + 1, newest.shape) for length in self.frame_shape[1:])
             stacked = cut(frames, numbers, top[..., None], left[..., None], crop_size, crop_size)
         indices = np.broadcast_to(indices, newest.shape)
