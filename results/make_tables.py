@@ -32,6 +32,8 @@ ROOT = RESULTS.parent
 SOURCE = "results/make_tables.py"
 # Pages that have some of the tables.
 PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in ("expect.md", "paper.md"))]
+# The columns of the main table, and their variants in agent/proof/runs.
+PROVED = {"SAC": "sac", "TQC": "tqc", "CrossQ": "crossq", "no loss": "no_loss", "SACAux": "sac_aux"}
 # What a search does to losses; the others are drawn at random, from priors, or given.
 EVOLVED = ("crossover", "replacement", "horizon_change")
 DRAWN, BEST = 20, 10
@@ -70,17 +72,34 @@ def filled(text: str, tables: dict[str, str]) -> str:
     return text
 
 
-def readme_table(rows: list[list[str]]) -> str:
+def readme_table(rows: list[list[str]] | dict[str, list[str]]) -> str:
     """A table of tables.yml."""
+    if isinstance(rows, dict):
+        rows = [["", *PROVED, "best published"], *(proof_row(*row) for row in rows.items())]
     return markdown(
         [[returns(RESULTS / cell) if any((RESULTS / cell).glob("seed-*")) else cell for cell in row] for row in rows]
     )
 
 
+def proof_row(name: str, values: list[str]) -> list[str]:
+    """A row of the main table: our runs where there are some, else a published mean, else a dash."""
+    if len(values) > len(PROVED):
+        return [name, *values]
+    task, sac, crossq, best = values
+    folders = [f"agent/proof/runs/{variant}/{task}" for variant in PROVED.values()]
+    published = [sac, "-", crossq, "-", "-"]
+    cells = [folder if (RESULTS / folder).exists() else text for folder, text in zip(folders, published, strict=True)]
+    return [name, *cells, best]
+
+
 def sentence(text: str) -> str:
-    """A text of tables.yml; a folder in braces becomes the mean of its last returns."""
-    text = re.sub(r"\{([\w-]+/[\w/-]+)\}", lambda found: returns(RESULTS / found[1]).split()[0], text)
-    return textwrap.fill(text, 126, break_on_hyphens=False)
+    """A text of tables.yml; a folder in braces becomes the mean of its last returns, with "seeds" before it their number."""
+
+    def figure(found: re.Match[str]) -> str:
+        mean, *_, number = returns(RESULTS / found[2]).split()
+        return f"{number.strip('()')} {'seed' if number == '(1)' else 'seeds'}" if found[1] else mean
+
+    return textwrap.fill(re.sub(r"\{(seeds )?([\w-]+/[\w/-]+)\}", figure, text), 126, break_on_hyphens=False)
 
 
 def returns(folder: Path) -> str:

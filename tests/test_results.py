@@ -15,7 +15,6 @@ from sb3_aarl.search.execution.matrix import stored_scores
 from sb3_aarl.search.execution.storage import load_study, open_storage
 from sb3_aarl.search.results.analysis import analysed, trial_table
 from sb3_aarl.search.results.report import stored_baselines
-from sb3_aarl.search.results.table import interquartile_means, read_runs
 from sb3_aarl.search.studies import benchmark
 from sb3_aarl.search.studies.benchmark import load_benchmark, read_experiment
 from scipy.stats import mannwhitneyu
@@ -89,10 +88,12 @@ def test_the_overview_is_short() -> None:
 
 
 def test_figures_in_the_text_of_the_first_readme() -> None:
-    tasks = read_runs(RESULTS / "agent/tasks/runs").query("environment == 'dm_control/cheetah-run-v0'")
-    iqm = interquartile_means(tasks).set_index("variant").loc["forward_simba"]
-    forward, sac = (statistics.mean(returns(f"agent/tasks/{name}")) for name in ("forward_simba", "sac_states"))
-    figures = [f"{forward:.0f} where SAC's is {sac:.0f}", f"{iqm['iqm']:.0f}", f"{iqm['low']:.0f} to {iqm['high']:.0f}"]
+    by_hand = re.sub(rf"<!-- {make_tables['SOURCE']}: \w+ -->.*?<!-- end -->|```.*?```", "", README)
+    assert {*re.findall(r"(?<![\w.])\d{2,}[\d,]*\b(?!\.)", by_hand)} == {"100,000", "2022"}, (
+        "numbers of runs come from a script"
+    )
+    quadruped = returns("agent/proof/sac_aux", "quadruped-run")
+    figures = [f"{statistics.mean(quadruped):.0f} ({len(quadruped)} seed"]
     names = ("paper/small/aarl_state_small", "paper/small/sac_dense_mlp_small")
     figures += [shown(returns(name, task)) for name in names for task in TASKS]
     figures += [shown(returns("paper/full_size/aarl_state_bf16"))]
