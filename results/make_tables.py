@@ -131,7 +131,7 @@ def benchmark_tables(folder: Path) -> Iterator[str]:
     found = table.read_tables(folder)
     for title, shown in table.text_tables(found).items():
         yield f"## {title}\n\n{from_frame(shown)}"
-    yield "\n\n".join([*table.footnotes(found), *table.missing(found.runs), *table.mixed(found.runs)])
+    yield from table.missing(found.runs) + table.mixed(found.runs)
     if (number := paper_tables.closest_table(found.runs["variant"])) is not None:
         mark = "▲ ▼: the difference is more than two standard errors, 2 sqrt(s²/n + S²/N)."
         beside = paper_tables.readable(paper_tables.beside(found.runs, number))

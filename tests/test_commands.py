@@ -1,18 +1,14 @@
 """Commands around a search and a run: shipped files by name, costs, status; evaluation and video of a model."""
 
-import json
 import re
-import shutil
 from pathlib import Path
 
 import gymnasium as gym
 import imageio.v3 as imageio
-import numpy as np
 import optuna
 import pytest
 import sb3_aarl.search.cli.console
 from executors import Planted
-from filelock import FileLock
 from optuna.samplers import BaseSampler, RandomSampler
 from sb3_aarl.search.cli.main import app
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
@@ -156,17 +152,13 @@ def test_init_writes_a_search_that_runs_and_overwrites_nothing(folder: Path) -> 
 @pytest.mark.slow
 def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder, SEARCH + "seeds: [0, 1]\n")
-    measured: dict[str, dict[str, float]] = {}
+    measured: dict[str, float] = {}
     monkeypatch.setattr("sb3_aarl.search.training.setup.measure", lambda run: measured.setdefault("small", measure(run)))
     output = run("search", "small.yml", "--workers", 4, "--dry-run")
     row = next(line for line in output.splitlines() if line.startswith("│ small"))
-    runs, gradient_ms, hours, _, core_hours = map(float, row.replace("│", "").split()[2:])
     # 2 random ones and a prior, then 3; two seeds.
-    assert runs == 12 and gradient_ms == float(f"{measured['small']['ms a gradient step']:.2g}")
-    # Training begins after 40 of 400 steps; there are two evaluations of an episode of 200 steps.
-    assert measured["small"]["hours"] > 360 * measured["small"]["ms a gradient step"] / 3.6e6
-    assert (hours, core_hours) == tuple(float(f"{n * measured['small']['hours']:.2g}") for n in (1, 12))
-    assert "All: 12 runs" in output and "with --workers 4" in output
+    assert [float(cell) for cell in row.split("│")[2:5]] == [12, *(float(f"{n * measured['small']:.2g}") for n in (1, 12))]
+    assert f"All: 12 runs, {12 / 4 * measured['small']:.2g} hours with --workers 4" in output
     assert not Path("runs").exists()
 
 
@@ -177,7 +169,7 @@ def test_a_benchmark_costs_what_is_not_finished(folder: Path, executor: Planted)
     assert not Path("bench").exists()
     run("benchmark", *options, "--seeds", "0")
     assert "All: 2 runs" in run("benchmark", *options, "--seeds", "0-2", "--dry-run")
-    assert "All runs are finished" in run("benchmark", *options, "--seeds", "0", "--dry-run")
+    assert "All: 0 runs" in run("benchmark", *options, "--seeds", "0", "--dry-run")
 
 
 def test_status_of_a_search_and_its_baselines(folder: Path, executor: Planted) -> None:
@@ -191,7 +183,7 @@ def test_status_of_a_search_and_its_baselines(folder: Path, executor: Planted) -
     assert "it was started with gamma=None, not 0.5" in run("baselines", "small.yml", code=2)
     write_search(folder, BASELINES)
     run("baselines", "small.yml")
-    assert re.search(r"SAC +│ +1 │ +1 │ +0 │ +0 │", run("status"))
+    assert re.search(r"SAC +│ +1 │ +1 │ +0 │", run("status"))
 
 
 @pytest.mark.parametrize("sampler", [AuxLossSampler(seed=0, population_size=2, n_random=2, n_prior=0), RandomSampler(seed=0)])
@@ -216,18 +208,13 @@ def test_status_of_a_study_made_in_python(sampler: BaseSampler) -> None:
 
 
 def test_status_of_a_benchmark(folder: Path) -> None:
-    for seed, steps in enumerate([(200,), (200,), (200,)]):
+    for seed in range(3):
         path = Path(f"bench/some/Pendulum-v1/seed-{seed}")
-        prepare_run(path, tiny_run(seed=seed, checkpoints=steps))
+        prepare_run(path, tiny_run(seed=seed, checkpoints=(200,)))
         (path / "provenance.json").write_text('{"variant": "some"}')
     train(Path("bench/some/Pendulum-v1/seed-0"))
     Path("bench/some/Pendulum-v1/seed-1/failed.json").write_text('{"reason": "it burst", "retry": false}')
-    with FileLock("bench/some/Pendulum-v1/seed-2/lock"):
-        shown = run("status", "bench")
-    assert re.search(r"some +│ +3 │ +1 │ +1 │ +1 │", shown) and re.search(r"bench, 0:\d\d:\d\d to go", shown)
-    shutil.copy("bench/some/Pendulum-v1/seed-1/failed.json", "bench/some/Pendulum-v1/seed-2")
-    shutil.rmtree("bench/some/Pendulum-v1/seed-0")
-    assert "bench, finished" in run("status", "bench")
+    assert re.search(r"some +│ +3 │ +1 │ +1 │", run("status", "bench"))
     assert "neither" in run("status", "nowhere", code=2)
 
 
@@ -255,32 +242,26 @@ def trained(folder: Path) -> Path:
 
 
 def test_a_model_is_evaluated_as_in_its_run(trained: Path) -> None:
-    data = json.loads(run("evaluate", trained, "--episodes", 3, "--seed", 5, "--json"))
-    assert len(data["returns"]) == 3 and data["mean"] == pytest.approx(np.mean(data["returns"]))
-    assert data["std"] == pytest.approx(np.std(data["returns"]))
+    shown = run("evaluate", trained, "--episodes", 3, "--seed", 5)
     # The sum of the actions, not of normalized rewards.
     (point,) = read_curve(trained / "curve.csv")
-    assert data["mean"] == pytest.approx(point.mean, abs=4)
-    shown = run("evaluate", trained / "model.zip", "Shown-v0", "--episodes", 3, "--seed", 5)
-    assert shown.startswith(f"{data['mean']:.1f} ± {data['std']:.1f}")
+    assert float(shown.partition(" ± ")[0]) == pytest.approx(point.mean, abs=4)
 
 
 def test_a_video_of_a_model(trained: Path) -> None:
     assert "20 pictures" in run("video", trained)
     assert imageio.imread(trained / "video.gif", index=None).shape == (20, 32, 32, 3)
-    run("video", trained / "model.zip", "--out", "deep/film.mp4", "--episodes", 2)
-    assert imageio.improps("deep/film.mp4", plugin="FFMPEG").shape[1:] == (32, 32, 3)
+    run("video", trained, "--out", "film.mp4", "--episodes", 2)
+    assert imageio.improps("film.mp4", plugin="FFMPEG").shape[1:] == (32, 32, 3)
 
 
 def test_what_cannot_be_played_is_one_line(trained: Path) -> None:
-    assert "nowhere.zip does not exist" in run("evaluate", "nowhere.zip", code=2)
-    (trained / "model.zip").rename("alone.zip")
-    assert "which environment?" in run("evaluate", "alone.zip", code=2)
-    assert "spaces do not match" in run("evaluate", "alone.zip", "Pendulum-v1", code=2)
-    assert "Unseen-v0 cannot be made" in run("video", "alone.zip", "Unseen-v0", code=2)
-    assert "Blind-v0 has no pictures" in run("video", "alone.zip", "Blind-v0", code=2)
-    assert "no_env cannot be imported" in run("evaluate", "alone.zip", "Shown-v0", "--imports", "no_env", code=2)
-    assert "model.zip does not exist" in run("video", trained, code=2)
+    text = (trained / "run.json").read_text()
+    for env, message in (("Unseen", "Unseen-v0 cannot be made"), ("Blind", "Blind-v0 has no pictures")):
+        (trained / "run.json").write_text(text.replace("Shown", env))
+        assert message in run("video", trained, code=2)
+    (trained / "model.zip").unlink()
+    assert "model.zip does not exist" in run("evaluate", trained, code=2)
 
 
 @pytest.mark.parametrize(
@@ -292,5 +273,3 @@ def test_observations_are_trained_on_as_they_are(env: str, policy: str, folder: 
     assert "mean and deviation" in run("evaluate", "run")
     trained = SACAux.load("run/model.zip", gym.make(env))
     assert trained.policy_class is SACAux.policy_aliases[policy]
-    SACAux(policy, gym.make(env), buffer_size=40).save("own.zip")
-    assert "mean and deviation" in run("evaluate", "own.zip", env)

@@ -16,6 +16,7 @@ import optuna
 import psutil
 import pytest
 from executors import InProcess
+from filelock import FileLock
 from optuna.trial import TrialState
 from postgres import Postgres
 from sb3_aarl.search.cli.main import app
@@ -25,7 +26,7 @@ from sb3_aarl.search.execution.executors import LocalExecutor
 from sb3_aarl.search.execution.queue import Queue
 from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.studies.search import Search
-from sb3_aarl.search.training.folder import is_finished, is_running
+from sb3_aarl.search.training.folder import LOCK, is_finished
 from tiny import SEARCH, tiny_run, write_search
 from typer.testing import CliRunner
 
@@ -225,7 +226,8 @@ def test_jobs_of_submitit(tmp_path: Path, undisturbed: Slots) -> None:
         queue.add(tmp_path / "long", tiny_run(checkpoints=(50_000, 100_000)))
         queue.update()
         wait_until(lambda: (tmp_path / "long/provenance.json").exists(), None)
-    wait_until(lambda: not is_running(tmp_path / "long"), None, 30)
+    with FileLock(tmp_path / "long" / LOCK, timeout=30):
+        assert not is_finished(tmp_path / "long")
 
 
 def load(folder: Path) -> optuna.Study:

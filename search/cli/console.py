@@ -77,21 +77,16 @@ def show_table(frame: "pd.DataFrame", title: str) -> None:
 
 
 def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
-    """Measure one run of each kind, and show what all of them would cost, beside each other where there are cores for them."""
-    import pandas as pd
+    """Measure one run of each kind, and show what all of them would cost."""
     from sb3_aarl.search.training.setup import measure
 
-    if not kinds:
-        say("All runs are finished.")
-        return
-    say(f"Measuring some seconds of each kind of run ({len(kinds)}) ...")
-    table = pd.DataFrame([{"": name, "runs": len(runs), **measure(runs[0])} for name, runs in kinds.items()])
-    table["core hours"] = table["runs"] * table["hours"] * [runs[0].threads for runs in kinds.values()]
-    show_table(table.map(lambda value: f"{value:.2g}" if isinstance(value, float) else str(value)), "Measured here")
-    n_runs = table["runs"].sum()
-    hours = (table["runs"] * table["hours"]).sum() / min(workers, n_runs)
-    memory = table["MB of buffer"].max() * min(workers, n_runs)
+    table, n_all, hours_of_all = Table("", "runs", "hours of each", "core hours"), 0, 0.0
+    for name, runs in kinds.items():
+        hours = measure(runs[0])
+        n_all, hours_of_all = n_all + len(runs), hours_of_all + len(runs) * hours
+        table.add_row(name, str(len(runs)), f"{hours:.2g}", f"{len(runs) * hours * runs[0].threads:.2g}")
+    console.print(table)
+    at_once = max(1, min(workers, n_all))
     say(
-        f"All: {n_runs} runs, {table['core hours'].sum():.2g} core hours; {hours:.2g} hours and at most {memory:,.1f} MB "
-        f"of buffers with --workers {workers}. Starting each takes some seconds more. Nothing was started."
+        f"All: {n_all} runs, {hours_of_all / at_once:.2g} hours with --workers {workers}, beside evaluations. Nothing started."
     )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from sb3_aarl.search.cli import options
 from sb3_aarl.search.cli.console import errors, live, say, show_costs, show_table, time_to_go
-from sb3_aarl.search.cli.options import Folder, Json, SearchFile, Storage, Threads, Workers, modules
+from sb3_aarl.search.cli.options import Folder, SearchFile, Storage, Threads, Workers, modules
 from sb3_aarl.search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -156,7 +156,6 @@ def benchmark(
     ] = None,
     imports: options.Imports = "",
     dry_run: options.DryRun = False,
-    json: Json = False,
 ) -> None:
     """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command resumes it."""
     from sb3_aarl.search.cli.results import table
@@ -176,5 +175,5 @@ def benchmark(
         show_costs(unfinished(matrix), workers)
         return
     train_matrix(matrix, workers)
-    table(folder, json=json)
+    table(folder)
     exit_if_failed(matrix)

@@ -23,7 +23,6 @@ DryRun = Annotated[
     bool, Option("--dry-run", help="Start nothing: measure some steps here, and show what all runs would cost.")
 ]
 Json = Annotated[bool, Option("--json", help="Print JSON instead.")]
-Model = Annotated[Path, Argument(help="Model of SACAux, such as model.zip, or the folder of a run that has one.")]
 Folder = Annotated[Path | None, Option(help="Folder of the search. Default: runs/ and the name of the configuration file.")]
 Benchmark = Annotated[Path, Argument(help="Folder of a benchmark.")]
 SearchFolder = Annotated[

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 from sb3_aarl.search.cli import options
-from sb3_aarl.search.cli.console import console, say, say_json, show_table, time_to_go
+from sb3_aarl.search.cli.console import say, say_json, show_table
 from sb3_aarl.search.cli.options import Folder, Storage, open_study, search_folder
 
 app = typer.Typer()
@@ -33,8 +33,6 @@ def table(
         return
     for title, shown in tables.text_tables(found).items():
         show_table(shown, title)
-    for line in tables.footnotes(found):
-        console.print(line, highlight=False)
     for line in tables.missing(found.runs) + tables.mixed(found.runs):
         say(line, style="red")
 
@@ -47,7 +45,7 @@ def status(
     storage: Storage = None,
     folder: Folder = None,
 ) -> None:
-    """Show how far a search, what belongs to it, or a benchmark is: runs done, running, failed, best so far, time to go."""
+    """Show how far a search, with its baselines and cross-validation, or a benchmark is."""
     from sb3_aarl.search.cli.search import progress_line
     from sb3_aarl.search.execution.storage import STUDY_FILE, open_storage
     from sb3_aarl.search.studies.status import PARTS, matrix_status, search_status
@@ -62,9 +60,9 @@ def status(
         say(f"Search {path}\n{progress_line(progress).replace('; ', chr(10))}, {progress.best_loss}{hint}")
         found = True
     for part in ("", *PARTS):
-        variants, to_go = matrix_status(path / part)
+        variants = matrix_status(path / part)
         if not variants.empty:
-            show_table(variants.astype(str), f"{path / part}, {time_to_go(to_go)}")
+            show_table(variants.astype(str), str(path / part))
             found = True
     if not found:
         raise ValueError(f"{path} has neither a search nor a benchmark. aarl search starts one")

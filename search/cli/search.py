@@ -1,6 +1,5 @@
 """The command ``aarl search``: it wires configuration, storage, sampler, executor, driver and notes."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -9,8 +8,6 @@ from sb3_aarl.search.cli.options import DryRun, Folder, SearchFile, Storage, Thr
 
 if TYPE_CHECKING:
     from sb3_aarl.search.execution.driver import SearchProgress
-    from sb3_aarl.search.studies.config import SearchConfig
-    from sb3_aarl.search.training.folder import Run
 
 app = typer.Typer()
 
@@ -54,8 +51,7 @@ def search(
         raise ValueError(f"--gpus-per-run: Slurm's jobs get whole GPUs, not {gpus_per_run}")
 
     from optuna import logging
-    from sb3_aarl.search.execution.storage import STUDY_FILE
-    from sb3_aarl.search.studies.search import Search
+    from sb3_aarl.search.studies.search import Search, planned_runs
     from sb3_aarl.search.training.provenance import hide_password
 
     logging.set_verbosity(logging.WARNING)
@@ -63,9 +59,7 @@ def search(
     settings, path = found.config, found.folder
     at_once = workers or (1 if executor == "local" else settings.population_size * len(settings.seeds))
     if dry_run:
-        show_costs(planned(settings), at_once)
-        if (path / STUDY_FILE).exists():
-            say(f"This counts all that the file says, also what is done: aarl status {path}")
+        show_costs(planned_runs(settings), at_once)
         return
     options = "" if storage is None else f" --storage {hide_password(storage)}"
     say(f"Study {found.study.study_name}. To watch it: aarl dashboard {path}{options}")
@@ -92,23 +86,6 @@ def search(
         if settings.cross_validation:
             options += "" if folder is None else f" --folder {folder}"
             say(f"Does it hold with other seeds? aarl cross-validate {config}{options}")
-
-
-def planned(config: "SearchConfig") -> "dict[str, list[Run]]":
-    """All runs of a search's file by kind: candidates, baselines, cross-validation."""
-    from sb3_aarl.search.execution.matrix import task_name
-    from sb3_aarl.search.studies import cross_validation
-    from sb3_aarl.search.studies.search import all_runs, baselines
-
-    runs: list[tuple[str, Run]] = [(config.name, run) for run in all_runs(config)]
-    runs += [(f"baselines: {cell.variant}", run) for cell, run in baselines(config, Path()).runs.items()]
-    names = {baseline.name for baseline in config.baselines}
-    for cell, run in cross_validation.all_runs(config).items() if config.cross_validation else ():
-        runs.append((f"cross-validate: {cell.variant if cell.variant in names else 'candidates'}", run))
-    kinds: dict[str, list[Run]] = {}
-    for name, run in runs:
-        kinds.setdefault(f"{name}, {task_name(run.environment)}", []).append(run)
-    return kinds
 
 
 def progress_line(progress: "SearchProgress") -> str:

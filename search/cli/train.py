@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 from rich.table import Table
-from sb3_aarl.search.cli.console import console, errors, say, say_json, time_to_go
-from sb3_aarl.search.cli.options import SHIPPED, Imports, Json, Model, modules
+from sb3_aarl.search.cli.console import console, errors, say, time_to_go
+from sb3_aarl.search.cli.options import SHIPPED, Imports, modules
 from sb3_aarl.search.training.shipped import find_file
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 FPS = 30  # pictures a second of a video
-ModelEnv = Annotated[str | None, typer.Argument(help="Environment. Default: that of the model's run.")]
+Trained = Annotated[Path, typer.Argument(help="Folder of a run, such as aarl train makes.")]
 
 
 @app.command(rich_help_panel="One agent")
@@ -96,55 +96,45 @@ def init(path: Annotated[Path, typer.Argument(help="File to write, such as own.y
 
 @app.command(rich_help_panel="One agent")
 def evaluate(
-    model: Model,
-    env: ModelEnv = None,
+    folder: Trained,
     episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 10,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
-    imports: Imports = "",
-    json: Json = False,
 ) -> None:
     """Show the return of a trained model: mean and deviation of episodes with its best actions."""
     import numpy as np
 
-    returns = play(model, env, episodes, seed, imports)
-    if json:
-        say_json({"mean": float(np.mean(returns)), "std": float(np.std(returns)), "returns": returns})
-    else:
-        say(f"{np.mean(returns):.1f} ± {np.std(returns):.1f}, mean and deviation over episodes: {episodes}")
+    returns = play(folder, episodes, seed)
+    say(f"{np.mean(returns):.1f} ± {np.std(returns):.1f}, mean and deviation over episodes: {episodes}")
 
 
 @app.command(rich_help_panel="One agent")
 def video(
-    model: Model,
-    env: ModelEnv = None,
+    folder: Trained,
     episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
-    imports: Imports = "",
     out: Annotated[
-        Path | None, typer.Option(help=".gif, or .mp4 (pip install imageio-ffmpeg). Default: video.gif beside the model.")
+        Path | None,
+        typer.Option(help="Such as film.gif or film.mp4 (pip install imageio-ffmpeg). Default: video.gif in the folder."),
     ] = None,
 ) -> None:
     """Film a trained model, whose environment takes render_mode, at 30 pictures a second."""
     import imageio.v3 as imageio
 
-    path = out or (model if model.is_dir() else model.parent) / "video.gif"
-    frames: list[Any] = []
-    returns = play(model, env, episodes, seed, imports, frames)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path, frames = out or folder / "video.gif", list[Any]()
+    returns = play(folder, episodes, seed, frames)
     # GIF counts in milliseconds, and repeats.
     imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix.lower() == ".gif" else {"fps": FPS}))
     say(f"Video: {path}, {len(frames)} pictures, returns {', '.join(f'{value:.1f}' for value in returns)}")
 
 
-def play(model: Path, env: str | None, episodes: int, seed: int, imports: str, frames: list[Any] | None = None) -> list[float]:
+def play(folder: Path, episodes: int, seed: int, frames: list[Any] | None = None) -> list[float]:
     """The returns of a model's episodes, and, where wanted, their pictures."""
     from sb3_aarl.search.training.setup import load_trained
     from stable_baselines3.common.evaluation import evaluate_policy
 
-    trained, environment = load_trained(model, env, frames is not None, modules(imports))
-    environment.seed(seed)
-    film = None if frames is None else lambda *_: frames.append(environment.render())
-    returns, _ = evaluate_policy(trained, environment, episodes, callback=film, return_episode_rewards=True)
-    environment.close()
-    assert isinstance(returns, list)
-    return [float(value) for value in returns]
+    model, env = load_trained(folder, renders=frames is not None)
+    env.seed(seed)
+    film = None if frames is None else lambda *_: frames.append(env.render())
+    returns: Any = evaluate_policy(model, env, episodes, callback=film, return_episode_rewards=True)[0]
+    env.close()
+    return returns

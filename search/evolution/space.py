@@ -104,9 +104,10 @@ def suggest_aux_loss(trial: BaseTrial, max_horizon: int = MAX_HORIZON, operators
     check_operators(operators)
     if isinstance(trial, FrozenTrial) and "horizon" in trial.params:
         return _loss_or_pruned(trial.params)
-    max_horizon, operators = _space_of(trial, max_horizon, operators)
+    has_slot, max_horizon, operators = _space_of(trial, max_horizon, operators)
     params: dict[str, Any] = {"horizon": trial.suggest_int("horizon", 1, max_horizon)}
-    max_horizon, operators = _space_of(trial, max_horizon, operators)  # as independent_sampler it has its slot only now
+    if not has_slot:  # the sampler is another one, perhaps with an AuxLossSampler as its independent_sampler
+        _, max_horizon, operators = _space_of(trial, max_horizon, operators)
     if params["horizon"] > max_horizon and isinstance(trial, optuna.Trial):
         raise optuna.TrialPruned(f"horizon is {params['horizon']}, longer than {max_horizon}")
     for name, distribution in distributions(params["horizon"], max_horizon, operators).items():
@@ -126,18 +127,18 @@ def _loss_or_pruned(params: Mapping[str, Any]) -> AuxLoss:
         raise optuna.TrialPruned(str(error)) from None
 
 
-def _space_of(trial: BaseTrial, max_horizon: int, operators: Sequence[str] | None) -> tuple[int, Sequence[str] | None]:
+def _space_of(trial: BaseTrial, max_horizon: int, operators: Sequence[str] | None) -> tuple[bool, int, Sequence[str] | None]:
     """
-    The space of the AuxLossSampler that gave the trial its slot, else the arguments. It is not read from ``study.sampler``,
-    which may be a sampler around that one.
+    Whether an AuxLossSampler has given the trial its slot, and the space of that sampler, else the arguments. It is not read
+    from ``study.sampler``, which may be a sampler around that one.
     """
     if not isinstance(trial, optuna.Trial):
-        return max_horizon, operators
+        return True, max_horizon, operators
     attributes = trial.study.get_trials(deepcopy=False)[trial.number].system_attrs
     slot = attributes.get(SLOT_KEY, {})
     max_horizon, operators = slot.get("max_horizon", max_horizon), slot.get("operators", operators)
     _check_enqueued(attributes.get("fixed_params", {}), max_horizon, operators)
-    return max_horizon, operators
+    return SLOT_KEY in attributes, max_horizon, operators
 
 
 def _check_enqueued(enqueued: Mapping[str, Any], max_horizon: int, operators: Sequence[str] | None) -> None:

@@ -11,6 +11,7 @@ from filelock import FileLock, Timeout
 from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, RDBStorage
 from sqlalchemy import URL, text
+from sqlalchemy.exc import OperationalError
 
 STUDY_FILE = "study.db"
 LOCK = "driver.lock"
@@ -62,14 +63,10 @@ def cause(error: BaseException | None) -> str:
 
 
 def is_temporary(error: BaseException) -> bool:
-    """Whether a database may recover by itself: it is unreachable, starting, or locked by another program."""
-    original = getattr(error.__cause__, "orig", None) if isinstance(error, StorageInternalError) else None
-    if original is None:
-        return False
-    if isinstance(original, sqlite3.Error):
-        return "locked" in str(original)
-    # PostgreSQL's codes of lost connections, deadlocks, too many connections, shutdowns. Without a server there is no code.
-    return (getattr(original, "sqlstate", None) or "08").startswith(("08", "40", "53300", "57"))
+    """Whether a database may recover by itself: a server is away, or SQLite's file is locked by another program."""
+    problem = error.__cause__ if isinstance(error, StorageInternalError) else None
+    is_of_sqlite = isinstance(getattr(problem, "orig", None), sqlite3.Error)
+    return isinstance(problem, OperationalError) and ("locked" in str(problem) or not is_of_sqlite)
 
 
 @contextmanager

@@ -76,7 +76,6 @@ def interquartile_means(runs: pd.DataFrame) -> pd.DataFrame:
         present = scale.dropna(subset="mean")
         is_common = present.groupby("environment")["variant"].nunique() == present["variant"].nunique()
         common = list(is_common.index[is_common])
-        skipped = ", ".join(map(task_name, is_common.index[~is_common]))
         tasks = task_name(common[0]) if len(common) == 1 else tasks
         for variant in present["variant"].unique() if common else ():
             planned = scale[scale["environment"].isin(common) & (scale["variant"] == variant)]
@@ -84,10 +83,8 @@ def interquartile_means(runs: pd.DataFrame) -> pd.DataFrame:
             samples = list(matrix.to_numpy())
             iqm = _iqm(*samples) if matrix.size else math.nan
             interval = _interval(samples, _iqm)
-            left_out = planned["mean"].count() - matrix.size
-            counts = (len(common), len(planned), matrix.size)
-            rows.append((checkpoint, tasks, variant, *counts, iqm, *interval, left_out, skipped))
-    columns = ["checkpoint", "tasks", "variant", "n_tasks", "planned", "runs", "iqm", "low", "high", "left_out", "skipped"]
+            rows.append((checkpoint, tasks, variant, len(common), len(planned), matrix.size, iqm, *interval))
+    columns = ["checkpoint", "tasks", "variant", "n_tasks", "planned", "runs", "iqm", "low", "high"]
     return pd.DataFrame(rows, columns=columns).sort_values("checkpoint", kind="stable", ignore_index=True)
 
 
@@ -209,29 +206,6 @@ def _few(better: pd.DataFrame) -> pd.DataFrame:
     n_variants = better.groupby("checkpoint")["variant"].transform("nunique")
     losses = better.groupby(["checkpoint", "over"])["probability"].transform("mean")
     return better[(n_variants <= MANY) | (losses == losses.groupby(better["checkpoint"]).transform("min"))]
-
-
-def footnotes(tables: Tables) -> list[str]:
-    """How to read :func:`text_tables`, as far as something in them needs it."""
-    _, _, iqm, every = tables
-    better = _few(every)
-    lines = []
-    if (iqm["runs"] < 4).any():
-        lines.append(
-            "The interquartile mean of fewer than four runs is their mean, and its interval goes from the smallest to the "
-            "largest."
-        )
-    if iqm["left_out"].any():
-        lines.append("Interquartile means leave out the seeds that a variant has on some of the tasks only.")
-    for (checkpoint, tasks), _ in iqm[iqm["skipped"] != ""].groupby(["checkpoint", "skipped"]):
-        lines.append(f"At {_steps(checkpoint)} not every variant has runs on {tasks}: interquartile means leave that out.")
-    if len(better) < len(every):
-        lines.append(f"Of more than {MANY} variants the probabilities over the best one are shown, all by --json.")
-    if better.groupby("checkpoint")["n_tasks"].nunique().gt(1).any():
-        lines.append("Each probability is over the tasks that both variants have runs on, which are not the same for all.")
-    if better["p"].notna().any():
-        lines.append("p: Mann and Whitney's, two-sided.")
-    return lines
 
 
 def as_data(tables: Tables) -> dict[str, Any]:

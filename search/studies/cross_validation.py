@@ -1,7 +1,7 @@
 """Cross-validation of a search's best candidates (paper, A.4): the best on one environment may have overfitted to it."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -17,9 +17,8 @@ from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
 from sb3_aarl.search.studies.search import check_study, search_matrix, stored_settings
 from sb3_aarl.search.training.config import ConfigError
-from sb3_aarl.search.training.folder import Run, is_finished
+from sb3_aarl.search.training.folder import is_finished
 
-from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.files import replace_text
 
@@ -86,15 +85,6 @@ def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
         yield replace(matrix, runs={cell: matrix.runs[cell] for cell in cells})
         waiting.clear()
         failed |= {cell.variant for cell in cells if not is_finished(cell_folder(matrix.folder, cell))} - baselines
-
-
-def all_runs(config: SearchConfig) -> Mapping[Cell, Run]:
-    """Baselines, and candidates that are not known yet, each with AARL-State: what a cross-validation would cost."""
-    loss, section = catalog.load("aarl-state"), _section(config)
-    candidates = [Baseline(name=f"candidate {n}", aux_loss=loss) for n in range(section.top + section.top_rated)]
-    n_more = section.budget - len(candidates) * len(section.seeds) if section.budget else 0
-    # Whichever candidates get those seeds.
-    return _make_matrix(config, Path(), [*candidates, *config.baselines], candidates[:1], n_more).runs
 
 
 def _section(config: SearchConfig) -> CrossValidation:

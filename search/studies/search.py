@@ -19,7 +19,7 @@ from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import suggest_aux_loss
 from sb3_aarl.search.execution.driver import Driver, SearchProgress
 from sb3_aarl.search.execution.executors import Executor
-from sb3_aarl.search.execution.matrix import Cell, Matrix
+from sb3_aarl.search.execution.matrix import Cell, Matrix, task_name
 from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.studies.config import Baseline, SearchConfig, corners, load_config, merge_space
 from sb3_aarl.search.training.folder import FREE, Run, differences
@@ -85,12 +85,23 @@ def _suggest(trial: optuna.Trial, name: str, distribution: Any) -> Any:
     return suggest(name, distribution.low, distribution.high, step=distribution.step, log=distribution.log)
 
 
-def all_runs(config: SearchConfig) -> list[Run]:
-    """As many runs as a search without failures has, all with SACAux's default loss, for an estimate of the cost."""
-    operations = AuxLossSampler(**config.sampler_settings()).operations
-    n_runs = sum(len(operations(number + 1)) for number in range(config.generations)) * len(config.seeds)
-    runs = [make_run(config, environment, None, config.seeds[0]) for environment in config.tasks]
-    return [run.model_copy(update={"aux_loss": "auto"}) for run in runs for _ in range(n_runs)]
+def planned_runs(config: SearchConfig) -> dict[str, list[Run]]:
+    """As many runs as a search without failures has, by kind and environment, all with one loss, to estimate the cost."""
+    operations, section = AuxLossSampler(**config.sampler_settings()).operations, config.cross_validation
+    n_slots = sum(len(operations(number + 1)) for number in range(config.generations))
+    kinds: list[Any] = [(config.name, n_slots * len(config.seeds), config.tasks, {})]
+    kinds.append(("baselines", len(config.baselines) * len(config.seeds), config.tasks, {}))
+    if section:
+        n_runs = section.budget or (section.top + section.top_rated) * len(section.seeds)
+        n_runs += len(config.baselines) * len(section.seeds)
+        kinds.append(("cross-validation", n_runs, section.environments or config.tasks, section.checkpoints))
+    runs = {}
+    for kind, n_runs, environments, checkpoints in kinds:
+        for environment in environments if n_runs else ():
+            run = make_run(config, environment, catalog.load("forward-dynamics"), 0)
+            run = run.model_copy(update={"checkpoints": checkpoints.get(environment, run.checkpoints)})
+            runs[f"{kind}, {task_name(environment)}"] = [run] * n_runs
+    return runs
 
 
 class Search:
@@ -122,10 +133,11 @@ class Search:
         :raises ConfigError: naming the file, when it cannot be used, or no run can be trained
         """
         config = load_config(path, **changes)
-        for environment, values in product(config.tasks, corners(config.space)):
+        for environment in config.tasks:
             run = make_run(config, environment, catalog.load("forward-dynamics"), config.seeds[0])
-            run = run.model_copy(update={"hyperparameters": merge_space(run.hyperparameters, values)})
-            setup = check_run(run, f"{path}: space {values}" if values else str(path))
+            for values in corners(config.space):
+                changes = {"hyperparameters": merge_space(run.hyperparameters, values)}
+                setup = check_run(run.model_copy(update=changes), f"{path}: space {values}" if values else str(path))
             if setup.episode_steps is not None and setup.episode_steps < (longest := config.max_horizon * setup.action_repeat):
                 message = "max_horizon is %d environment steps, episodes have %d: losses with longer horizons have no window"
                 logger.warning(message, longest, setup.episode_steps)

@@ -10,10 +10,9 @@ from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.execution import driver
-from sb3_aarl.search.execution.queue import seconds_to_go
 from sb3_aarl.search.execution.storage import has_driver
 from sb3_aarl.search.studies.search import stored_settings
-from sb3_aarl.search.training.folder import RUN, is_running, read_outcome
+from sb3_aarl.search.training.folder import RUN, read_outcome
 from sb3_aarl.search.training.provenance import read_about
 
 from sb3_aarl.aux_loss import AuxLoss
@@ -39,21 +38,12 @@ def search_status(study: optuna.Study, storage: BaseStorage, folder: Path) -> tu
     return driver.search_progress(study, generations), has_driver(storage, study.study_name, folder)
 
 
-def matrix_status(folder: Path) -> tuple[pd.DataFrame, float | None]:
-    """
-    The runs of each variant of a matrix: all, done, running, failed; and the estimated seconds until all are over, None while
-    that is not known.
-    """
-    rows = []
-    for path in sorted(file.parent for file in folder.glob(f"*/*/*/{RUN}")):
-        outcome = read_outcome(path)
-        done = outcome is not None and outcome.failure is None
-        failed = outcome is not None and not done
-        seconds = outcome.curve[-1].seconds if outcome is not None and done else None
-        rows.append((read_about(path)["variant"], done, outcome is None and is_running(path), failed, seconds))
-    runs = pd.DataFrame(rows, columns=["variant", "done", "running", "failed", "seconds"])
-    by_variant = runs.groupby("variant", sort=False)
-    table = by_variant[["done", "running", "failed"]].sum().astype(int)
-    table.insert(0, "runs", by_variant.size())
-    left = int((table["runs"] - table["done"] - table["failed"]).sum())
-    return table.reset_index(), seconds_to_go(list(runs["seconds"].dropna()), left, int(runs["running"].sum()))
+def matrix_status(folder: Path) -> pd.DataFrame:
+    """How many runs of each variant of a matrix there are, are done, and failed."""
+    outcomes = {file.parent: read_outcome(file.parent) for file in sorted(folder.glob(f"*/*/*/{RUN}"))}
+    rows = [
+        (read_about(path)["variant"], 1, bool(outcome and outcome.failure is None), bool(outcome and outcome.failure))
+        for path, outcome in outcomes.items()
+    ]
+    runs = pd.DataFrame(rows, columns=["variant", "runs", "done", "failed"])
+    return runs.groupby("variant", sort=False).sum().astype(int).reset_index()

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pydantic
-from filelock import FileLock, Timeout
 from sb3_aarl.search.training.config import validated
 
 from sb3_aarl.callbacks import Evaluation, read_curve
@@ -103,17 +102,6 @@ def is_finished(folder: Path) -> bool:
     run = read_run(folder)
     steps = tuple(evaluation.environment_steps for evaluation in partial_curve(folder))
     return steps == run.checkpoints and (not run.keep_model or (folder / MODEL).exists())
-
-
-def is_running(folder: Path) -> bool:
-    """Whether a process of this machine trains a run."""
-    if not (folder / LOCK).exists():
-        return False
-    try:
-        with FileLock(folder / LOCK, timeout=0, fallback_to_soft=False):
-            return False
-    except Timeout:
-        return True
 
 
 def read_run(folder: Path) -> Run:

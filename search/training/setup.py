@@ -23,17 +23,14 @@ from sb3_aarl.search.training.config import (
     check_hyperparameters,
     env_wrappers,
     import_modules,
-    resolve_env_id,
 )
-from sb3_aarl.search.training.folder import MODEL, NORMALIZE, RUN, Run, one_line, read_run
+from sb3_aarl.search.training.folder import MODEL, NORMALIZE, Run, one_line, read_run
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_aarl import AuxLoss, SACAux
-from sb3_aarl.buffers import ARRAYS, WindowReplayBuffer
 from sb3_aarl.callbacks import SingleEpisodes
 from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
 from sb3_aarl.sac_aux import default_learning_starts
@@ -43,10 +40,8 @@ logger = logging.getLogger(__name__)
 # Evaluations are normalized with the statistics of training, and have the task's own rewards.
 FIXED = {"training": False, "norm_reward": False}
 VIDEO_SIZE = 320  # pixels of a film, height and width
-# Agent steps of a run that is tried out: so that there are windows.
-TRIED_STEPS = 20
-MEASURED_SECONDS = 2.0
-MEASURED_STEPS = 50  # at least, so that there are windows
+TRIED_STEPS = 20  # agent steps of a run that is tried out, so that there are windows
+MEASURED_SECONDS = 3.0
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any], env_wrapper: Any = None, renders: bool = False) -> gym.Env:
@@ -184,65 +179,36 @@ def try_out(model: SACAux) -> None:
     model.learn(TRIED_STEPS * model.n_envs, step)
 
 
-def measure(run: Run) -> dict[str, float]:
-    """Train a run for some seconds, and return what the whole run would take here, evaluations included."""
+def measure(run: Run) -> float:
+    """Train a run for some seconds, and return the hours that all of its training would take here."""
     th.set_num_threads(run.threads)
     setup = Setup(run, run.environment)
     with closing(setup.training_env()) as env:
         model = setup.model(env)
-        learning_starts, gradient_steps = model.learning_starts, model.gradient_steps
-        model.learning_starts = MEASURED_STEPS - 2
-        model.learn(MEASURED_STEPS)  # the first of everything is slow
-        model.learning_starts = model.gradient_steps = 0  # actions of the policy, and no training
+        n_steps = setup.agent_steps - model.learning_starts
+        try_out(model)  # the first of everything is slow
         started = time.monotonic()
         model.learn(10**9, lambda *_: time.monotonic() - started < MEASURED_SECONDS)  # type: ignore[arg-type]
-        agent_step = (time.monotonic() - started) / model.num_timesteps
-        n, started = 0, time.monotonic()
-        while time.monotonic() - started < MEASURED_SECONDS:
-            model.train(1, model.batch_size)
-            n += 1
-        gradient_step = (time.monotonic() - started) / n
-        episode = (setup.episode_steps or EPISODE_LENGTH) / setup.action_repeat
-        assert isinstance(model.train_freq, TrainFreq)
-        frequency, unit = model.train_freq
-        rollout = frequency * env.num_envs * (episode if unit == TrainFrequencyUnit.EPISODE else 1)
-        n_updates = max(0, setup.agent_steps - learning_starts) * (1 if gradient_steps < 0 else gradient_steps / rollout)
-        evaluated = len(run.checkpoints) * run.evaluation_episodes * episode
-        buffer = model.replay_buffer
-        assert isinstance(buffer, WindowReplayBuffer)
-        arrays = [*(store.frames for store in buffer.stores.values()), *(getattr(buffer, name) for name in ARRAYS)]
-        share = min(1.0, setup.agent_steps / buffer.buffer_size / env.num_envs)  # it takes memory as it fills
-    return {
-        "ms a gradient step": 1000 * gradient_step,
-        "hours": ((setup.agent_steps + evaluated) * agent_step + n_updates * gradient_step) / 3600,
-        "MB of buffer": share * sum(array.nbytes for array in arrays) / 1e6,
-    }
+        return n_steps * (time.monotonic() - started) / model.num_timesteps / 3600
 
 
-def load_trained(
-    path: Path, environment: str | None = None, renders: bool = False, imports: Sequence[str] = ()
-) -> tuple[SACAux, VecEnv]:
-    """A trained model, and an environment for it: by default that of its run."""
-    folder = path if path.is_dir() else path.parent
-    model = folder / MODEL if path.is_dir() else path
-    if not model.is_file():
-        raise ValueError(f"{model} does not exist: name a model, or the folder of a run that has one, such as of aarl train")
-    run = read_run(folder) if (folder / RUN).exists() else None
-    import_modules([*(run.imports if run else ()), *imports])
-    if environment is None and run is None:
-        raise ValueError(f"which environment? No {RUN} is beside {model}: name it as a second argument")
-    env_id = resolve_env_id(environment) if environment is not None else run.environment  # type: ignore[union-attr]
-    settings = run.hyperparameters if run else {}
+def load_trained(folder: Path, renders: bool = False) -> tuple[SACAux, VecEnv]:
+    """The model of a run's folder, and an environment for it, as that of the run."""
+    if not (folder / MODEL).is_file():
+        raise ValueError(f"{folder / MODEL} does not exist: name the folder of a run that has one, such as of aarl train")
+    run = read_run(folder)
+    import_modules(run.imports)
+    settings = run.hyperparameters
     env_kwargs = settings.get("env_kwargs") or {}
-    if renders and env_id.startswith(PREFIX) and not env_kwargs.get("pixels"):
+    if renders and run.environment.startswith(PREFIX) and not env_kwargs.get("pixels"):
         env_kwargs = {"image_size": VIDEO_SIZE, **env_kwargs}
     try:
-        env: VecEnv = make_vec_env(lambda: make_env(env_id, env_kwargs, settings.get("env_wrapper"), renders))
+        env: VecEnv = make_vec_env(lambda: make_env(run.environment, env_kwargs, settings.get("env_wrapper"), renders))
     except TypeError as error:  # Gymnasium's, for an environment that takes no render_mode
-        raise ValueError(f"{env_id} cannot be made: {error}") from error
+        raise ValueError(f"{run.environment} cannot be made: {error}") from error
     if renders and "rgb_array" not in env.get_attr("metadata")[0].get("render_modes", ()):
-        raise ValueError(f"{env_id} has no pictures: its metadata's render_modes are without rgb_array")
+        raise ValueError(f"{run.environment} has no pictures: its metadata's render_modes are without rgb_array")
     if (folder / NORMALIZE).exists():
         env = VecNormalize.load(str(folder / NORMALIZE), env)
         env.training = env.norm_reward = False
-    return SACAux.load(model, env), env
+    return SACAux.load(folder / MODEL, env), env
