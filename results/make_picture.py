@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import pandas as pd
-from sb3_aarl.search.results.plots import learning_curves_plot
-from sb3_aarl.search.studies.benchmark import read_curves
+from paper_figures import learning_curves_plot, read_curves
 
 RESULTS = Path(__file__).parent
 FOLDERS = ("agent/tasks/runs", "paper/small/runs")

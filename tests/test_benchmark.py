@@ -8,13 +8,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import paper_figures
 import paper_tables
 import pytest
 from sb3_aarl.search.execution.executors import LocalExecutor
 from sb3_aarl.search.execution.matrix import Cell, cell_folder, check_matrix, run_matrix, scores
 from sb3_aarl.search.results import table
-from sb3_aarl.search.studies.benchmark import load_benchmark, parse_seeds, parse_steps, read_abouts, read_curves
-from sb3_aarl.search.studies.status import matrix_status
+from sb3_aarl.search.studies.benchmark import load_benchmark, parse_seeds, parse_steps, read_abouts
 from sb3_aarl.search.training import provenance
 from sb3_aarl.search.training.config import load_hyperparameters
 from sb3_aarl.search.training.folder import read_outcome
@@ -153,7 +153,7 @@ def test_other_seeds_of_a_variant_are_trained_alike(
 def test_a_run_that_is_there_twice_is_refused(folder: Path) -> None:
     plant(load("mine.yml plain.yml", seeds=[0, 1], checkpoints=[200, 400]))
     assert len(read_abouts(Path("out"))) == 4
-    curves = read_curves(Path("out"))
+    curves = paper_figures.read_curves(Path("out"))
     assert len(curves) == 8 and set(curves["env"]) == {ENV} and set(curves["environment_steps"]) == {200, 400}
     path = cell_folder(Path("out"), Cell("mine", ENV, 1))
     assert ".." not in cell_folder(Path("out"), Cell("..", ENV, 1)).parts
@@ -164,7 +164,7 @@ def test_a_run_that_is_there_twice_is_refused(folder: Path) -> None:
     (path / ABOUT).write_text("{}")
     assert len(read_abouts(Path("out"))) == 3
     with pytest.raises(ValueError, match="no learning curves"):
-        read_curves(folder / "nowhere")
+        paper_figures.read_curves(folder / "nowhere")
 
 
 def test_the_time_to_go_is_that_of_the_runs_that_are_left(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +177,6 @@ def test_the_time_to_go_is_that_of_the_runs_that_are_left(folder: Path, monkeypa
     write_curve(cell_folder(Path("out"), next(iter(matrix.runs))) / "curve.csv", curve)
     future.set_result({"curve": [list(point) for point in curve], "failure": None, "retry": False})
     assert next(progress) == (3, 1, 0, pytest.approx(80))
-    assert matrix_status(Path("out"))[1] == pytest.approx(80)
 
 
 @pytest.mark.slow

@@ -179,7 +179,7 @@ def test_a_folder_is_that_of_one_search(folder: Path, executor: Planted) -> None
     shutil.copy("small.yml", "other.yml")
     assert "mine is the folder of the search small" in run("search", "other.yml", "--folder", "mine", code=2)
     assert "small" in run("cross-validate", "other.yml", "--folder", "mine", code=2)
-    assert "Search mine" in run("status", "small.yml", "--folder", "mine")
+    assert "Search mine" in run("status", "mine")
 
 
 def test_errors_have_no_password(folder: Path) -> None:
@@ -325,6 +325,6 @@ def test_a_benchmark_grows_and_names_what_failed(folder: Path, executor: Planted
     assert "Failed: " not in run("benchmark", *options.split(), "--seeds", "0")
     output = run("benchmark", *options.split(), "--seeds", "0,1", code=1)
     assert output.count("Failed: ") == 2 and len(executor.runs) == 4
-    assert json.loads(run("table", "bench", "--json", "--curves", "curves.png")) and Path("curves.png").exists()
+    assert json.loads(run("table", "bench", "--json"))
     assert "evaluations" in run("benchmark", *options.replace("200,400", "100,400").split(), "--seeds", "0", code=2)
     assert "--every" in run("benchmark", *options.split(), "--every", "20k,30k", code=2)

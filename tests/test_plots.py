@@ -14,7 +14,7 @@ from optuna.trial import TrialState, create_trial
 from sb3_aarl.search.evolution.space import distributions, loss_to_params, random_loss
 from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.results import analysis
-from sb3_aarl.search.results.plots import evolution_plot, learning_curves_plot
+from sb3_aarl.search.results.plots import evolution_plot
 
 LEFT_OUT = "80 candidates, 4 trials without a comparable score left out"
 
@@ -141,7 +141,7 @@ def curves():
 
 
 def test_learning_curves_are_means_and_deviations_over_seeds(curves):
-    figure = learning_curves_plot(curves)
+    figure = paper_figures.learning_curves_plot(curves)
     titles = [axes.get_title() for axes in figure.axes]
     assert set(titles) == {"cheetah\n1 to 4 seeds (shade of one: its episodes)", "walker\n4 seeds"}
     for axes in figure.axes:
@@ -168,7 +168,7 @@ def test_learning_curves_are_means_and_deviations_over_seeds(curves):
 def test_many_variants_are_told_apart_and_leave_room_for_the_curves(curves):
     one = curves.query("env == 'walker' and variant == 'aarl'")
     many = pd.concat([one.assign(variant=f"a_variant_with_a_long_name_{number}") for number in range(14)])
-    figure = learning_curves_plot(many)
+    figure = paper_figures.learning_curves_plot(many)
     (axes,) = figure.axes
     # In grey too; of dashes of one's own get_linestyle() says "--" only.
     assert len({(str(line._unscaled_dash_pattern), line.get_marker()) for line in axes.lines}) == 14

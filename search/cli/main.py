@@ -11,9 +11,8 @@ from sb3_aarl.search.cli import matrices, results, search, train
 from sb3_aarl.search.cli.console import errors
 from typer.core import TyperGroup
 
-# The extras of modules that training does not need.
-EXTRAS = {"imageio": "search", "psycopg": "postgres", "ray": "ray", "submitit": "slurm"}
-SEARCH_MODULES = ("matplotlib", "optuna", "optuna_dashboard", "pandas", "scipy", "sqlalchemy", "tenacity")
+# Extras of modules; of the others that are not always installed it is `search`.
+EXTRAS = {"psycopg": "postgres", "ray": "ray", "submitit": "slurm"}
 
 
 class Program(TyperGroup):
@@ -42,8 +41,7 @@ def explain(error: Exception) -> str | None:
         line = f"{error.filename}: {error.strerror}"
     if isinstance(error, ModuleNotFoundError):
         module = (error.name or "").partition(".")[0]
-        extra = "search" if module in SEARCH_MODULES else EXTRAS.get(module)
-        return extra and f"{line}: pip install 'sb3-aarl[{extra}]'"
+        return f"{line}: pip install 'sb3-aarl[{EXTRAS.get(module, 'search')}]'"
     if "gymnasium" in sys.modules:
         from gymnasium.error import Error
 

@@ -26,7 +26,7 @@ Json = Annotated[bool, Option("--json", help="Print JSON instead.")]
 Folder = Annotated[Path | None, Option(help="Folder of the search. Default: runs/ and the name of the configuration file.")]
 Benchmark = Annotated[Path, Argument(help="Folder of a benchmark.")]
 SearchFolder = Annotated[
-    Path | None, Argument(help="Folder of a search, or its configuration file. Default: the only one in runs/.")
+    Path | None, Argument(help="Folder of a search, or its configuration file. Not needed with --storage.")
 ]
 Storage = Annotated[
     str | None,
@@ -44,28 +44,20 @@ def modules(imports: str) -> list[str]:
     return imports.split(",") if imports else []
 
 
-def search_folder(folder: Path | None, storage: str | None) -> Path | None:
-    """The folder of a search, named itself or by its configuration file, or the only one; None if there is a storage only."""
-    from sb3_aarl.search.execution.storage import STUDY_FILE
-
-    if folder is not None:
-        default = Path("runs") / folder.stem
-        is_config = folder.suffix.lower() in (".yml", ".yaml") or (not folder.exists() and default.exists())
-        return default if is_config else folder
-    if storage is not None:
+def search_folder(search: Path | None) -> Path | None:
+    """The folder of a search, which is named itself or by its configuration file."""
+    if search is None:
         return None
-    folders = sorted(path.parent for path in Path("runs").glob(f"*/{STUDY_FILE}"))
-    if len(folders) != 1:
-        names = ", ".join(map(str, folders)) or "none"
-        raise ValueError(f"name the folder of a search, or its --storage; in runs/ there are: {names}")
-    return folders[0]
+    default = Path("runs") / search.stem
+    is_config = search.suffix.lower() in (".yml", ".yaml") or (not search.exists() and default.exists())
+    return default if is_config else search
 
 
-def open_study(folder: Path | None, storage: str | None) -> "tuple[Study, Path]":
+def open_study(search: Path | None, storage: str | None) -> "tuple[Study, Path]":
     """The study in a folder, or the one of the folder's name in a database, and its folder."""
     from sb3_aarl.search.execution.storage import load_study, open_storage
 
-    path = search_folder(folder, storage)
+    path = search_folder(search)
     opened = open_storage(path, storage, create=False)
     study = load_study(opened, path.name if path is not None and storage is not None else None)
     return study, path or Path("runs") / study.study_name

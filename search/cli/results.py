@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from sb3_aarl.search.cli import options
 from sb3_aarl.search.cli.console import say, say_json, show_table
-from sb3_aarl.search.cli.options import Folder, Storage, open_study, search_folder
+from sb3_aarl.search.cli.options import Storage, open_study, search_folder
 
 app = typer.Typer()
 
@@ -15,19 +15,12 @@ app = typer.Typer()
 @app.command(rich_help_panel="Many agents")
 def table(
     folder: options.Benchmark = options.BENCHMARK,
-    curves: Annotated[
-        Path | None, typer.Option(help="File for a figure of the learning curves (the paper's figure 9): .png, .pdf or .svg.")
-    ] = None,
     json: options.Json = False,
 ) -> None:
     """Show a benchmark: means and deviations, interquartile means and probabilities of improvement."""
     from sb3_aarl.search.results import table as tables
-    from sb3_aarl.search.results.plots import learning_curves_plot
-    from sb3_aarl.search.studies.benchmark import read_curves
 
     found = tables.read_tables(folder)
-    if curves is not None:
-        learning_curves_plot(read_curves(folder)).savefig(curves)
     if json:
         say_json(tables.as_data(found))
         return
@@ -39,18 +32,15 @@ def table(
 
 @app.command(rich_help_panel="A search")
 def status(
-    search: Annotated[
-        Path | None, typer.Argument(help="Folder of a search or a benchmark, or a search's file. Default: the only search.")
-    ] = None,
+    search: Annotated[Path | None, typer.Argument(help="Folder of a search or a benchmark, or a search's file.")] = None,
     storage: Storage = None,
-    folder: Folder = None,
 ) -> None:
     """Show how far a search, with its baselines and cross-validation, or a benchmark is."""
     from sb3_aarl.search.cli.search import progress_line
     from sb3_aarl.search.execution.storage import STUDY_FILE, open_storage
     from sb3_aarl.search.studies.status import PARTS, matrix_status, search_status
 
-    path = search_folder(folder or search, storage)
+    path = search_folder(search)
     found = False
     if storage is not None or path is None or (path / STUDY_FILE).exists():
         study, path = open_study(path, storage)
@@ -72,14 +62,13 @@ def status(
 def report(
     search: options.SearchFolder = None,
     storage: Storage = None,
-    folder: Folder = None,
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
 ) -> None:
     """Write a report of a search as one HTML file: best losses, cross-validation, patterns (table 5), lineage."""
     from sb3_aarl.search.execution.matrix import stored_scores
     from sb3_aarl.search.results.report import stored_baselines, write_report
 
-    searched, path = open_study(folder or search, storage)
+    searched, path = open_study(search, storage)
     out = out or path / "report.html"
     write_report(searched, out, stored_baselines(path), stored_scores(path / "cross-validation"))
     say(f"Report: {out}")
@@ -89,17 +78,13 @@ def report(
 def dashboard(
     search: options.SearchFolder = None,
     storage: Storage = None,
-    folder: Folder = None,
-    host: Annotated[
-        str, typer.Option(help="Address to listen on; the default is reached from this machine only.")
-    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
 ) -> None:
-    """Watch a search in optuna-dashboard. Everybody who reaches it can change and delete studies."""
+    """Watch a search in optuna-dashboard, from this machine. Who opens it can change and delete studies."""
     from optuna_dashboard import run_server
     from sb3_aarl.search.execution.storage import open_storage
 
-    opened = open_storage(search_folder(folder or search, storage), storage, create=False)
-    say(f"http://{host}:{port}/  (Ctrl-C to stop; --port for another port)")
+    opened = open_storage(search_folder(search), storage, create=False)
+    say(f"http://127.0.0.1:{port}/  (Ctrl-C to stop; --port for another port)")
     with suppress(KeyboardInterrupt):
-        run_server(opened, host=host, port=port)
+        run_server(opened, host="127.0.0.1", port=port)

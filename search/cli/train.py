@@ -52,15 +52,13 @@ def train(
         to_go = seconds_to_go([point.seconds / len(curve)], evaluations - len(curve), 1)
         errors.print(f"{point.environment_steps:,} environment steps: {point.mean:.1f} ± {point.std:.1f}, {time_to_go(to_go)}")
 
-    # A job's log has no place for a bar.
-    bar, on_evaluation = (True, None) if console.is_terminal else (False, show)
     path = prepare_one(env, aux_loss, hyperparams, steps, evaluations, episodes, seed, threads, folder, modules(imports))
     if is_finished(path):
         errors.print(f"{path} is finished: this is its result")
     else:
         planned = ", ".join(f"{point:,}" for point in read_run(path).checkpoints)
         errors.print(f"Into {path}; evaluations, from which it can be resumed, at {planned} environment steps")
-    curve = train_run(path, bar, on_evaluation)
+    curve = train_run(path, show)
     title = f"Mean of the evaluations (AULC) {aulc(curve):.1f}"
     table = Table("environment steps", "mean return", "deviation", "seconds", title=title)
     for column in table.columns:
@@ -110,21 +108,19 @@ def evaluate(
 @app.command(rich_help_panel="One agent")
 def video(
     folder: Trained,
-    episodes: Annotated[int, typer.Option(help="How many episodes.", min=1)] = 1,
-    seed: Annotated[int, typer.Option(help="Seed of the first episode.", min=0)] = 0,
     out: Annotated[
         Path | None,
         typer.Option(help="Such as film.gif or film.mp4 (pip install imageio-ffmpeg). Default: video.gif in the folder."),
     ] = None,
 ) -> None:
-    """Film a trained model, whose environment takes render_mode, at 30 pictures a second."""
+    """Film an episode of a trained model, whose environment takes render_mode, at 30 pictures a second."""
     import imageio.v3 as imageio
 
     path, frames = out or folder / "video.gif", list[Any]()
-    returns = play(folder, episodes, seed, frames)
+    returns = play(folder, 1, 0, frames)
     # GIF counts in milliseconds, and repeats.
     imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix.lower() == ".gif" else {"fps": FPS}))
-    say(f"Video: {path}, {len(frames)} pictures, returns {', '.join(f'{value:.1f}' for value in returns)}")
+    say(f"Video: {path}, {len(frames)} pictures, return {returns[0]:.1f}")
 
 
 def play(folder: Path, episodes: int, seed: int, frames: list[Any] | None = None) -> list[float]:

@@ -1,7 +1,6 @@
 """The candidates of all slots, as a function of seed, settings and the results of earlier generations."""
 
 import contextlib
-import logging
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -13,8 +12,6 @@ from sb3_aarl.search.evolution import mutations, space
 from sb3_aarl.search.evolution.surrogate import TokenModel
 
 from sb3_aarl.aux_loss import AuxLoss
-
-logger = logging.getLogger(__name__)
 
 # Draws for one slot before a duplicate is accepted: only very small spaces run out of new losses.
 MAX_DRAWS = 300
@@ -236,7 +233,6 @@ class Candidates:
             return self._draw_new(rng, "replacement", slot, is_known)
         if candidate is None:
             raise RuntimeError(f"no valid loss in {MAX_DRAWS} draws by {operation}")
-        logger.info("No new loss in %d draws by %s: %s is a duplicate", MAX_DRAWS, operation, candidate.loss)
         return candidate
 
     def _offspring(self, rng: np.random.Generator, operation: str, slot: int) -> Candidate:

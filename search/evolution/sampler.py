@@ -303,9 +303,7 @@ class _Slots:
         if not free:
             generation = int(min(self.candidates.generation, self.last))
             free = [(generation, self._size(generation) + number)]
-            others = [other for other in self.unfinished if other != number]
-            why = f"running trials {others} occupy all slots" if generation == self.candidates.generation else "it is over"
-            logger.warning("Trial %d gets an extra slot of generation %d: %s", number, generation, why)
+            logger.warning("Trial %d gets an extra slot of generation %d, which has no free one", number, generation)
         (generation, slot), attempt = free[0], self.failed[free[0]]
         key: dict[str, Any] = {"seed": self.candidates.seed, "generation": generation, "slot": slot, "attempt": attempt}
         key |= {"max_horizon": self.sampler.max_horizon, "operators": self.sampler.operators}

@@ -22,7 +22,7 @@ from sb3_aarl.search.execution.queue import Job, Queue, seconds_to_go
 from sb3_aarl.search.execution.storage import cause, driver_lock, is_temporary
 from sb3_aarl.search.training.folder import Run, partial_curve
 from sb3_aarl.search.training.provenance import commit, read_about, versions
-from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
+from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay, wait_fixed
 
 from sb3_aarl.callbacks import Evaluation, aulc
 
@@ -96,13 +96,8 @@ class Driver:
         self.running: dict[int, RunningTrial] = {}
         self.n_failures = 0
         # Any call may fail while the database is unreachable; all of them may be repeated.
-        self._patiently = Retrying(
-            retry=retry_if_exception(is_temporary),
-            wait=wait_random_exponential(multiplier=0.5, max=30),
-            stop=stop_after_delay(PATIENCE_SECONDS),
-            before_sleep=_warn,
-            reraise=True,
-        )
+        retry, stop = retry_if_exception(is_temporary), stop_after_delay(PATIENCE_SECONDS)
+        self._patiently = Retrying(retry=retry, stop=stop, wait=wait_fixed(5), before_sleep=_warn, reraise=True)
 
     def __iter__(self) -> Generator[SearchProgress]:
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import pandas as pd
 from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.queue import Queue, seconds_to_go
-from sb3_aarl.search.training.config import check_checkpoints
 from sb3_aarl.search.training.folder import FAILED, Run, is_finished, partial_curve, prepare_run, read_outcome
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
 from sb3_aarl.search.training.setup import check_run
@@ -81,18 +80,17 @@ def cell_folder(folder: Path, cell: Cell) -> Path:
 
 def check_matrix(matrix: Matrix, source: str = "") -> None:
     """
-    Check the checkpoints of all runs, and try out one of those that have the same hyper-parameters, unless it is finished: on
-    each environment that may be of the user's own, and on one task of DeepMind Control.
+    Try out one of the runs that have the same hyper-parameters and checkpoints, unless it is finished: on each environment
+    that may be of the user's own, and on one task of DeepMind Control.
 
     :param source: The file of their settings, for runs whose ``abouts`` name none
     :raises ConfigError: when a run cannot be trained
     """
     checked = set()
     for cell, run in matrix.runs.items():
-        check_checkpoints(run.checkpoints, run.hyperparameters, f"{cell.variant} on {cell.environment}")
         environment = PREFIX if run.environment.startswith(PREFIX) else run.environment
         settings = {**run.hyperparameters, "n_timesteps": None}
-        kind = environment, run.aux_loss is None, json.dumps(settings)
+        kind = environment, run.checkpoints, run.aux_loss is None, json.dumps(settings)
         if kind not in checked and not is_finished(cell_folder(matrix.folder, cell)):
             check_run(run, matrix.abouts.get(cell, {}).get("file", source))
             checked.add(kind)

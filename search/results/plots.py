@@ -1,4 +1,4 @@
-"""Figures of studies and benchmarks, as pure functions of their tables."""
+"""Figures of studies, as pure functions of their tables."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from optuna.study import StudyDirection
 from sb3_aarl.search.results import analysis
 
@@ -16,7 +16,6 @@ BLUE, ORANGE = "#1f4e79", "#c55a11"
 COLOURS = (BLUE, ORANGE, "#000000", "#7f7f7f", "#6aa7d6")
 # Lines differ by dash and symbol, not by colour alone: they have to be told apart in grey.
 LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
-SYMBOLS = ("o", "s", "D", "^", "P", "X", "v")
 SCORE = "Score (AULC, mean return)"
 
 
@@ -46,38 +45,6 @@ def evolution_plot(
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_xlabel("Generation")
         axes.set_title(f"{title}\n{count_candidates(table)}", fontsize=9)
-    add_legend(figure, panels)
-    return figure
-
-
-def learning_curves_plot(curves: pd.DataFrame, unit: str = "seed") -> Figure:
-    """
-    Learning curves with their deviation over seeds, one panel a task: the paper's figure 9; ``unit`` is what a seed is.
-
-    A point is drawn where all seeds of its variant and task have one. The shade is the standard deviation over the seeds;
-    where there is one seed only, over its episodes.
-    """
-    tasks, variants = list(curves["env"].unique()), list(curves["variant"].unique())
-    figure, panels = make_panels(tasks, "Return (mean ± std)", columns=4, width=3.3, height=2.7)
-    for axes, task in zip(panels, tasks, strict=True):
-        for position, variant in enumerate(variants):
-            runs = curves[(curves["env"] == task) & (curves["variant"] == variant)]
-            n_seeds = runs["seed"].nunique()
-            statistics = {"n": ("mean", "count"), "mean": ("mean", "mean"), "spread": ("mean", "std")}
-            if n_seeds == 1:
-                statistics["spread"] = ("std", "mean")
-            points = runs.groupby("environment_steps").agg(**statistics).query("n == @n_seeds")
-            if len(points):
-                # Five lines and seven symbols: no two of 35 variants look alike.
-                look = {"ls": LINES[position % len(LINES)], "marker": SYMBOLS[position % len(SYMBOLS)], "lw": 1.6, "ms": 4.5}
-                colour, every = COLOURS[position % len(COLOURS)], max(1, len(points) // 8)
-                axes.plot(points.index, points["mean"], color=colour, markevery=every, label=str(variant), **look)
-                low, high = points["mean"] - points["spread"], points["mean"] + points["spread"]
-                axes.fill_between(points.index, low, high, color=colour, alpha=0.18, linewidth=0)
-        axes.set_title(f"{task}\n{_seeds(curves[curves['env'] == task], unit)}", fontsize=9)
-        axes.set_xlabel("Environment steps", fontsize=9)
-        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     add_legend(figure, panels)
     return figure
 
@@ -124,10 +91,3 @@ def count_candidates(table: pd.DataFrame) -> str:
     n = len(analysis.analysed(table))
     left_out = f", {len(table) - n} trials without a comparable score left out" if n < len(table) else ""
     return f"{n} candidates{left_out}"
-
-
-def _seeds(curves: pd.DataFrame, unit: str) -> str:
-    counts = curves.groupby("variant")["seed"].nunique()
-    low, high = counts.min(), counts.max()
-    text = f"{low} to {high} {unit}s" if low < high else f"{low} {unit}{'s' if low > 1 else ''}"
-    return text + (" (shade of one: its episodes)" if low == 1 else "")

@@ -7,9 +7,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pandas as pd
 from pydantic import BaseModel
-from sb3_aarl.search.execution.matrix import Cell, Matrix, task_name
+from sb3_aarl.search.execution.matrix import Cell, Matrix
 from sb3_aarl.search.training.config import (
     ConfigError,
     action_repeat,
@@ -20,7 +19,7 @@ from sb3_aarl.search.training.config import (
     resolve_env_id,
     validated,
 )
-from sb3_aarl.search.training.folder import FREE, Run, differences, partial_curve
+from sb3_aarl.search.training.folder import FREE, Run, differences
 from sb3_aarl.search.training.provenance import ABOUT, read_about
 from sb3_aarl.search.training.shipped import find_file
 
@@ -164,21 +163,6 @@ def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
         if other != path:
             raise ValueError(f"{other} and {path} have the same run: {cell.variant} on {cell.environment}, seed {cell.seed}")
     return abouts
-
-
-def read_curves(folder: Path) -> pd.DataFrame:
-    """
-    The learning curves of a benchmark's runs: one row an evaluation with ``variant``, ``env`` (short form), ``seed``,
-    ``environment_steps``, ``mean`` and ``std`` (of the episodes' returns). Runs without an evaluation are skipped.
-    """
-    rows = [
-        (about["variant"], task_name(about["environment"]), about["seed"], point.environment_steps, point.mean, point.std)
-        for path, about in read_abouts(folder).items()
-        for point in partial_curve(path)
-    ]
-    if not rows:
-        raise ValueError(f"{folder} has no learning curves of a benchmark")
-    return pd.DataFrame(rows, columns=["variant", "env", "seed", "environment_steps", "mean", "std"])
 
 
 def parse_steps(text: str) -> tuple[int, ...]:

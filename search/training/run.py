@@ -46,11 +46,7 @@ EVALUATION_SEED = 10_000
 EVALUATION_SEEDS = 1_000_000
 
 
-def train(
-    folder: Path,
-    progress_bar: bool = False,
-    on_evaluation: Callable[[list[Evaluation]], object] | None = None,
-) -> list[Evaluation]:
+def train(folder: Path, on_evaluation: Callable[[list[Evaluation]], object] = lambda curve: None) -> list[Evaluation]:
     """
     Train the run of a folder, after :func:`prepare_run`, in this process, from its last checkpoint on; that of a finished run
     is read. On a CPU, a run that was killed and resumed ends bit for bit like an undisturbed one if ``reset(seed)`` determines
@@ -64,7 +60,7 @@ def train(
         if not is_finished(folder):
             (folder / FAILED).unlink(missing_ok=True)
             try:
-                _train(folder, read_run(folder), progress_bar, on_evaluation)
+                _train(folder, read_run(folder), on_evaluation)
             except FloatingPointError:  # it would fail again from the checkpoint
                 checkpoint.remove(folder)
                 raise
@@ -73,7 +69,7 @@ def train(
         return partial_curve(folder)
 
 
-def _train(folder: Path, run: Run, progress_bar: bool, on_evaluation: Callable[[list[Evaluation]], object] | None) -> None:
+def _train(folder: Path, run: Run, on_evaluation: Callable[[list[Evaluation]], object]) -> None:
     th.set_num_threads(run.threads)
     setup = Setup(run, str(folder / RUN))
     state = checkpoint.read(folder)
@@ -95,13 +91,12 @@ def _train(folder: Path, run: Run, progress_bar: bool, on_evaluation: Callable[[
         def report() -> None:
             model.dump_logs()  # as SB3 does every fourth episode: TensorBoard has a point for each evaluation, the last too
             write_curve(folder / CURVE, evaluations.curve)
-            if on_evaluation is not None:
-                on_evaluation(evaluations.curve)
+            on_evaluation(evaluations.curve)
 
         add_session(folder, aux_loss=str(model.aux_loss), device=str(model.device), threads=run.threads)
         checkpoints = checkpoint.CheckpointCallback(folder, run.seed, evaluations.curve, report, folder / STOP, state)
         del state  # mapped from a file that will be replaced
-        model.learn(setup.agent_steps, [evaluations, checkpoints], progress_bar=progress_bar)
+        model.learn(setup.agent_steps, [evaluations, checkpoints])
         if not checkpoints.stopped:
             if run.keep_model:
                 unfinished = folder / f"unfinished-{MODEL}"
