@@ -154,6 +154,8 @@ class RunningNorm(nn.Module):
         self.register_buffer("running_batches", th.tensor(0.0))
 
     def forward(self, x: th.Tensor) -> th.Tensor:
+        # A number that stands for "nothing there" may be so large that its square is infinite.
+        x = x.clamp(-1e15, 1e15)
         if self.training and th.is_grad_enabled():
             with th.no_grad():
                 self.running_batches += 1

@@ -210,9 +210,12 @@ def test_running_statistics_are_those_of_the_batches() -> None:
     norm(batches[0] + 100)
     th.testing.assert_close(norm.running_mean, th.cat(batches).mean(dim=0))
     th.testing.assert_close(norm.running_var, th.cat(batches).var(dim=0, unbiased=False))
-    constant = RunningNorm(2)
-    constant(th.ones(5, 2))
-    assert constant.eval()(th.tensor([[2.0, 0.0]])).tolist() == [[10, -10]]  # as VecNormalize clips
+    clipped = RunningNorm(2)
+    clipped(th.ones(5, 2))
+    assert clipped.eval()(th.tensor([[2.0, 0.0]])).tolist() == [[10, -10]]  # as VecNormalize clips
+    largest = th.tensor([[1.0, th.finfo(th.float32).max], [2.0, 0.0]])
+    for _ in range(2):
+        assert clipped.train()(largest).isfinite().all()
 
 
 def test_running_statistics_are_shared_saved_and_not_learnt_from_predictions(tmp_path: Path) -> None:
