@@ -507,6 +507,8 @@ class SACAux(SAC):
             self._last_obs = None
         if self.learning_starts is None:
             self.learning_starts = default_learning_starts(total_timesteps)
+            if self.verbose >= 1:
+                print(f"Learning starts after {self.learning_starts} steps with random actions")
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if self._n_updates and self._n_aux_skipped == self._n_updates:
             message = f"the auxiliary loss was never trained: no episode is as long as its horizon ({self.aux_loss})"

@@ -11,7 +11,9 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig, load_config
+from sb3_aarl.search.studies.single import prepare_one
 from sb3_aarl.search.training.config import ConfigError, check_hyperparameters, load_hyperparameters, read_yaml, resolve_env_id
+from sb3_aarl.search.training.folder import read_run
 from sb3_aarl.search.training.setup import make_env
 
 from sb3_aarl import AuxLoss, SACAux, catalog
@@ -91,8 +93,16 @@ def test_sac_of_the_template_is_sb3s() -> None:
     config = load_config(ZOO / "search" / "template.yml")
     baseline, sac = config.baselines[0], load_hyperparameters(ZOO / "sac.yml", config.environment)
     assert baseline.aux_loss is sac.pop("aux_loss") is None
-    assert sac.pop("policy") == "MlpPolicy" and sac.pop("n_timesteps")
+    assert sac.pop("policy") == "MlpPolicy"
     assert config.hyperparameters_for(config.environment, baseline) == sac
+
+
+def test_a_search_without_hyperparameters_has_those_of_aarl_train(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_aarl.search.studies.single.check_run", lambda *_: None)
+    config = load_config(write(tmp_path, {"environment": "cheetah-run", "checkpoints": [400]}))
+    trained = read_run(prepare_one("cheetah-run", None, None, folder=tmp_path / "run")).hyperparameters
+    assert config.hyperparameters_for(config.environment) == trained
+    assert trained["env_kwargs"] == {"action_repeat": 2}
 
 
 def test_all_searches_of_one_kind_have_the_same_baselines() -> None:

@@ -146,7 +146,7 @@ class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
     :param environments: Several of them instead, on which each candidate is trained one after the other; its score is the
         mean over them
     :param hyperparameters: File of hyper-parameters for ``load_hyperparameters``, relative to the file of the search, or the
-        name of a shipped one; None for SACAux's defaults
+        name of a shipped one; None for ``sac_aux``: SACAux's defaults, and the action repeat of DeepMind Control's tasks
     :param checkpoints: Environment steps of the evaluations, ascending; the last one ends the run
     :param evaluation_episodes: Episodes of each evaluation
     :param generations: Number of generations of the evolution (the paper's "stages")
@@ -254,11 +254,13 @@ class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
         return dict(self._checked[key])
 
     def _entry(self, environment: str) -> dict[str, Any]:
-        if self.hyperparameters is None:
-            return {}
+        file = self.hyperparameters or find_file(Path("sac_aux"))
         if not self._file:
-            self._file.update(training.read_yaml(self.hyperparameters))
-        return training.entry_of(self._file, environment, str(self.hyperparameters))
+            self._file.update(training.read_yaml(file))
+        entry = training.entry_of(self._file, environment, str(file))
+        if self.hyperparameters is None:
+            entry.pop("policy", None)  # the one that fits the observations
+        return entry
 
     def sampler_settings(self) -> dict[str, Any]:
         """The arguments of ``AuxLossSampler``, the number of generations included."""

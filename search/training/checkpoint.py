@@ -67,11 +67,14 @@ def save(folder: Path, model: SACAux, curve: Sequence[Evaluation]) -> None:
         },
         "curve": [list(evaluation) for evaluation in curve],
     }
-    with (folder / UNFINISHED).open("wb") as file:
-        th.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    (folder / UNFINISHED).replace(folder / CHECKPOINT)
+    try:
+        with (folder / UNFINISHED).open("wb") as file:
+            th.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        (folder / UNFINISHED).replace(folder / CHECKPOINT)
+    finally:
+        (folder / UNFINISHED).unlink(missing_ok=True)  # what is left of it on a full disk: the reason needs room
 
 
 def read(folder: Path) -> dict[str, Any] | None:
