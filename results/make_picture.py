@@ -1,4 +1,4 @@
-"""Draw docs/images/curves.png, README's picture, from the runs that lie beside it: SACAux and SAC with the same sizes."""
+"""Draw docs/images/curves.png from the runs in this folder: SACAux's former defaults and SAC with the same sizes."""
 
 from pathlib import Path
 
@@ -9,9 +9,9 @@ RESULTS = Path(__file__).parent
 FOLDERS = ("agent/tasks/runs", "paper/small/runs")
 # What the picture calls each variant.
 VARIANTS = {
-    "forward_simba": "SACAux: forward dynamics, encoder simba",
-    "aarl_state_small": "SACAux: the paper's AARL-State and encoder",
-    "aarl_state_small_repeat_2": "SACAux: the paper's AARL-State and encoder",
+    "forward_simba": "SACAux, its former defaults",
+    "aarl_state_small": "SACAux, the paper's loss and encoder",
+    "aarl_state_small_repeat_2": "SACAux, the paper's loss and encoder",
     "sac_states": "SAC",
     "sac_starts_5000": "SAC",
 }
@@ -30,13 +30,13 @@ def main() -> None:
     curves = curves[curves["variant"].isin(VARIANTS) & curves["env"].isin(PUBLISHED)].drop_duplicates()  # linked runs
     curves = curves[(curves["env"] != "walker-walk") | (curves["variant"] != "aarl_state_small")]  # action repeat 4 there
     curves["variant"] = pd.Categorical(curves["variant"].map(VARIANTS), list(dict.fromkeys(VARIANTS.values())))
-    figure = learning_curves_plot(curves.sort_values(["env", "variant"]))
+    figure = learning_curves_plot(curves.sort_values(["env", "variant"]), columns=2, width=2.7)
     for axes in figure.axes:
         returns = PUBLISHED[axes.get_title().partition("\n")[0]]
         axes.scatter([100_000] * len(returns), list(returns.values()), marker="_", s=120, color="black", zorder=3)
-        names = ", ".join(f"{name} {value}" for name, value in returns.items())
-        axes.annotate(f"published: {names}", (0.98, 0.02), xycoords="axes fraction", ha="right", fontsize=6)
-    figure.savefig(RESULTS.parent / "docs" / "images" / "curves.png", dpi=110, bbox_inches="tight")
+        names = ", ".join(f"{name} {value:,}" for name, value in returns.items())
+        axes.set_title(f"{axes.get_title()}\n— {names}", fontsize=9)
+    figure.savefig(RESULTS.parent / "docs" / "images" / "curves.png", dpi=140, bbox_inches="tight")
 
 
 if __name__ == "__main__":

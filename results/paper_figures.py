@@ -59,15 +59,16 @@ def read_curves(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["variant", "env", "seed", "environment_steps", "mean", "std"])
 
 
-def learning_curves_plot(curves: pd.DataFrame, unit: str = "seed") -> Figure:
+def learning_curves_plot(curves: pd.DataFrame, unit: str = "seed", columns: int = 4, width: float = 3.3) -> Figure:
     """
-    Learning curves with their deviation over seeds, one panel a task: the paper's figure 9; ``unit`` is what a seed is.
+    Learning curves with their deviation over seeds, one panel a task: the paper's figure 9; ``unit`` is what a seed is,
+    ``columns`` are panels beside each other, ``width`` that of one.
 
     A point is drawn where all seeds of its variant and task have one. The shade is the standard deviation over the seeds;
     where there is one seed only, over its episodes.
     """
     tasks, variants = list(curves["env"].unique()), list(curves["variant"].unique())
-    figure, panels = make_panels(tasks, "Return (mean ± std)", columns=4, width=3.3, height=2.7)
+    figure, panels = make_panels(tasks, "Return (mean ± std)", columns, width, height=2.7)
     for axes, task in zip(panels, tasks, strict=True):
         for position, variant in enumerate(variants):
             runs = curves[(curves["env"] == task) & (curves["variant"] == variant)]
