@@ -31,7 +31,8 @@ RESULTS = Path(__file__).resolve().parent
 ROOT = RESULTS.parent
 SOURCE = "results/make_tables.py"
 # Pages that have some of the tables.
-PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in ("expect.md", "paper.md"))]
+GUIDES = ("expect.md", "losses.md", "paper.md", "results.md")
+PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in GUIDES)]
 # The columns of the main table, and their variants in agent/proof/runs.
 PROVED = {"SAC": "sac", "TQC": "tqc", "CrossQ": "crossq", "no loss": "no_loss", "SACAux": "sac_aux"}
 # What a search does to losses; the others are drawn at random, from priors, or given.
