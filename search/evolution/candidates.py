@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
@@ -115,7 +115,6 @@ class Candidates:
         self.parents: list[Result] = []
         self.model = TokenModel(settings.max_horizon)
         self.known: dict[AuxLoss, Result] = {}  # the first scored trial of each canonical form
-        self.repeats: Counter[AuxLoss] = Counter()
         self.plan: dict[tuple[int, int], Candidate] = {}
         self.to_plan = deque(self._round())
         # Canonical forms in the order in which they came, and how many there were at the end of each round.
@@ -175,8 +174,6 @@ class Candidates:
     def _plan_next(self) -> None:
         slot = self.to_plan[0]
         self.plan[slot] = self._draw(*slot, 0, self.seen.__contains__)
-        if self.plan[slot].operation == "again":
-            self.repeats[self.plan[slot].loss.canonical()] += 1
         self.seen.setdefault(self.plan[slot].loss.canonical(), len(self.seen))
         self.to_plan.popleft()
         if not self.to_plan:
@@ -218,7 +215,8 @@ class Candidates:
         """Thompson sampling: the loss that one draw from the posterior of all losses rates highest, with its next seed."""
         results = list(self.known.values())
         best = results[int(np.argmax(self.model.draw([result.loss for result in results], rng)))]
-        return Candidate(best.loss, "again", (best.number,), 1 + self.repeats[best.loss.canonical()])
+        n_before = sum(planned.operation == "again" and planned.loss == best.loss for planned in self.plan.values())
+        return Candidate(best.loss, "again", (best.number,), 1 + n_before)
 
     def _draw_new(self, rng: np.random.Generator, operation: str, slot: int, is_known: IsKnown) -> Candidate:
         """One offspring, redrawn while it is invalid or known."""

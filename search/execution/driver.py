@@ -111,7 +111,7 @@ class Driver:
                 self.queue.update()
                 for running in list(self.running.values()):
                     self._check(running)
-                while self.queue.has_room and self._patiently(self.sampler.free_slots, self.study) > 0:
+                while len(self.queue.jobs) < self.workers and self._patiently(self.sampler.free_slots, self.study) > 0:
                     self._start(self._patiently(self._ask))
                 yield self._patiently(lambda: search_progress(self.study, self.sampler.progress(self.study)))
                 if not self.running and self._patiently(self.sampler.is_complete, self.study):

@@ -49,11 +49,6 @@ class Queue:
         self.retries = retries
         self.jobs: list[Job] = []
 
-    @property
-    def has_room(self) -> bool:
-        """Whether the next run would be submitted at once."""
-        return len(self.jobs) < self.workers
-
     def add(self, folder: Path, run: Run) -> Job:
         """Add a run to the end of the queue."""
         job = Job(folder, run, self.retries)
