@@ -93,7 +93,7 @@ def test_figures_in_the_text_of_the_first_readme() -> None:
         "numbers of runs come from a script"
     )
     quadruped = returns("agent/proof/sac_aux", "quadruped-run")
-    figures = [f"{statistics.mean(quadruped):.0f} ({len(quadruped)} seed"]
+    figures = [f"a return of {statistics.mean(quadruped):.0f} after 100,000 environment steps ({len(quadruped)} seed"]
     names = ("paper/small/aarl_state_small", "paper/small/sac_dense_mlp_small")
     figures += [shown(returns(name, task)) for name in names for task in TASKS]
     figures += [shown(returns("paper/full_size/aarl_state_bf16"))]
