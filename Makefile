@@ -1,4 +1,5 @@
 # make demo    a small search on DeepMind Control's Cheetah-Run, and a training with what it found
+# make models  three small trained agents in runs/, some minutes each: aarl evaluate, aarl video
 # make test    all tests, what they need included
 # make check   lint, types, and the tests that are not slow
 # make lint    ruff and mypy
@@ -14,13 +15,18 @@ BROWSER := chromium chromium-driver
 DATABASE := postgresql
 DEMO := dmc,search
 
-.PHONY: demo test check lint docs wheel system clean
+.PHONY: demo models test check lint docs wheel system clean
 
 demo: $(VENV)/.installed
 	$(BIN)/aarl search zoo_configs/search/demo.yml --workers 2
 	$(BIN)/aarl cross-validate zoo_configs/search/demo.yml --workers 2
 	$(BIN)/aarl train cheetah-run --steps 20000 --aux-loss runs/demo/winner.yml --folder runs/demo/winner
 	$(BIN)/aarl report runs/demo
+
+models: $(VENV)/.installed
+	$(BIN)/aarl train Pendulum-v1 --steps 5000 --folder runs/pendulum
+	$(BIN)/aarl train reacher-easy --steps 20000 --folder runs/reacher
+	$(BIN)/aarl train ball_in_cup-catch --steps 20000 --folder runs/catch
 
 test: $(VENV)/.installed-dev system
 	$(BIN)/python -m pytest -n 2 --dist worksteal

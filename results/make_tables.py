@@ -31,7 +31,7 @@ RESULTS = Path(__file__).resolve().parent
 ROOT = RESULTS.parent
 SOURCE = "results/make_tables.py"
 # Pages that have some of the tables.
-GUIDES = ("expect.md", "losses.md", "paper.md", "results.md")
+GUIDES = ("expect.md", "from_sac.md", "losses.md", "paper.md", "results.md")
 PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in GUIDES)]
 # The columns of the main table, and their variants in agent/proof/runs.
 PROVED = {"SACAux": "sac_aux", "no loss": "no_loss", "SAC": "sac", "CrossQ": "crossq", "TQC": "tqc"}
