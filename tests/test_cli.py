@@ -182,10 +182,12 @@ def test_a_folder_is_that_of_one_search(folder: Path, executor: Planted) -> None
     assert "Search mine" in run("status", "mine")
 
 
-def test_errors_have_no_password(folder: Path) -> None:
+def test_errors_of_a_database_name_their_cause_and_no_password(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_search(folder)
-    error = run("search", "small.yml", "--storage", "postgresql+psycopg://me:s3cret@127.0.0.1:1/none", code=2)
-    assert "127.0.0.1" in error and "s3cret" not in error
+    monkeypatch.setitem(sys.modules, "MySQLdb", None)
+    for kind, cause in (("postgresql+psycopg", "127.0.0.1"), ("mysql", "MySQLdb")):
+        error = run("search", "small.yml", "--storage", f"{kind}://me:s3cret@127.0.0.1:1/none", code=2)
+        assert cause in error and "s3cret" not in error
 
 
 def test_a_missing_extra_is_named(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:

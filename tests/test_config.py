@@ -270,6 +270,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
         {"environment": None, "environments": [PENDULUM], "cross_validation": {"environments": ["walker-run"]}},
         "cross_validation.returns: dm_control/walker-run-v0 is missing",
     ),
+    (
+        {"cross_validation": {"environments": ["walker-run"], "checkpoints": {"Pendulum-v1": [4]}}},
+        "cross_validation.checkpoints: Pendulum-v1 is none of its environments",
+    ),
     ({"space": {"gamma": {"type": "float", "low": 0.9}}}, "space.gamma: must be a list of choices, or {type: .*not {"),
     ({"space": {"gamma": {"type": "float", "low": 0.9, "high": 0.8}}}, "space.gamma: .*low"),
     ({"space": {"gama": [0.9]}}, "space.gama: gama: unknown key, .*'gamma'"),

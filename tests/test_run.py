@@ -1,7 +1,9 @@
 """A run and its folder: what is refused, how it ends, what it leaves."""
 
+import contextlib
 import json
 import logging
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -255,6 +257,18 @@ class Exits(PendulumEnv):
 
 gym.register("Exits-v0", Exits, max_episode_steps=10)
 """
+
+
+def test_a_full_disk_is_the_reason_of_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A limit on the size of files stands for it: a part of a checkpoint would take the room of the reason."""
+    prepare_run(tmp_path, make_run())
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    with pytest.raises(OSError, match="File too large"), contextlib.ExitStack() as stack:
+        stack.callback(resource.setrlimit, resource.RLIMIT_FSIZE, limits)
+        run_program(tmp_path, monkeypatch)
+    assert "File too large" in str(read_outcome(tmp_path))
+    assert not [path for path in tmp_path.iterdir() if path.stat().st_size > 10_000]
 
 
 @pytest.mark.slow

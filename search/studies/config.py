@@ -294,6 +294,9 @@ def load_config(path: str | Path, **changes: Any) -> SearchConfig:
             config.hyperparameters_for(env_id, baseline)
         if config.environments and config.returns_on(env_id) is None:
             raise ConfigError(f"{path}: cross_validation.returns: {env_id} is missing, with the returns that count as 0 and 1")
+    for name, given in (("checkpoints", section.checkpoints), ("returns", section.returns)) if section else ():
+        if unused := ", ".join(sorted(given.keys() - set(validated))):
+            raise ConfigError(f"{path}: cross_validation.{name}: {unused} is none of its environments")
     for env_id, corner in product(config.tasks, corners(config.space)):
         for name in corner:
             values = merge_space(config.hyperparameters_for(env_id), {name: corner[name]})

@@ -12,12 +12,11 @@ import yaml
 from optuna.study import StudyDirection
 from sb3_aarl.search.evolution.racing import next_runs, standings
 from sb3_aarl.search.evolution.surrogate import TokenModel
-from sb3_aarl.search.execution.matrix import Cell, Matrix, cell_folder, scores
+from sb3_aarl.search.execution.matrix import Cell, Matrix, scores
 from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
 from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
 from sb3_aarl.search.studies.search import check_study, search_matrix, stored_settings
 from sb3_aarl.search.training.config import ConfigError
-from sb3_aarl.search.training.folder import is_finished
 
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.files import replace_text
@@ -82,9 +81,11 @@ def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
         cells = [cell for cell in matrix.runs if (cell.variant, cell.seed) in chosen or cell in waiting]
         if not cells:
             return
-        yield replace(matrix, runs={cell: matrix.runs[cell] for cell in cells})
+        part = replace(matrix, runs={cell: matrix.runs[cell] for cell in cells})
+        yield part
         waiting.clear()
-        failed |= {cell.variant for cell in cells if not is_finished(cell_folder(matrix.folder, cell))} - baselines
+        trained = scores(part).dropna(subset="score")  # of a finished run too, a score may be NaN
+        failed |= {cell.variant for cell in {*cells}.difference(trained.iloc[:, :3].itertuples(index=False))} - baselines
 
 
 def _section(config: SearchConfig) -> CrossValidation:

@@ -73,6 +73,9 @@ def save(folder: Path, model: SACAux, curve: Sequence[Evaluation]) -> None:
             file.flush()
             os.fsync(file.fileno())
         (folder / UNFINISHED).replace(folder / CHECKPOINT)
+    except RuntimeError as error:
+        # PyTorch closes its archive, which fails too, and hides the error of the disk.
+        raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
     finally:
         (folder / UNFINISHED).unlink(missing_ok=True)  # what is left of it on a full disk: the reason needs room
 

@@ -100,10 +100,13 @@ def _train(folder: Path, run: Run, on_evaluation: Callable[[list[Evaluation]], o
         if not checkpoints.stopped:
             if run.keep_model:
                 unfinished = folder / f"unfinished-{MODEL}"
-                model.save(unfinished)
-                if isinstance(env, VecNormalize):
-                    env.save(str(folder / NORMALIZE))
-                unfinished.replace(folder / MODEL)
+                try:
+                    model.save(unfinished)
+                    if isinstance(env, VecNormalize):
+                        env.save(str(folder / NORMALIZE))
+                    unfinished.replace(folder / MODEL)
+                finally:
+                    unfinished.unlink(missing_ok=True)  # what is left of it on a full disk
             write_about(folder, {**read_about(folder), "seconds": evaluations.curve[-1].seconds})
             report()
 
