@@ -34,9 +34,9 @@ class Program(TyperGroup):
 
 def explain(error: Exception) -> str | None:
     """One line, without passwords, about an error that a user can fix; None for another one."""
-    if type(error) is ImportError and isinstance(error.__cause__, ModuleNotFoundError):
-        # Optuna's, which does not name the missing driver of a database.
-        return explain(error.__cause__) or f"{error.__cause__}, which this database needs"
+    driver = error.__cause__ if type(error) is ImportError else None
+    if isinstance(driver, ModuleNotFoundError):  # of a database, which Optuna's error does not name
+        return explain(driver) if driver.name in EXTRAS else f"{driver}, which this database needs"
     kinds: list[type[Exception]] = [ValueError, OSError, FloatingPointError]
     problems = str(error).splitlines() if isinstance(error, ValueError) else [str(error)]
     line = "\n".join(" ".join(problem.split()) for problem in problems)
