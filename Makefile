@@ -24,7 +24,7 @@ demo: $(VENV)/.installed
 	$(BIN)/aarl report runs/demo
 
 models: $(VENV)/.installed
-	$(BIN)/aarl train Pendulum-v1 --steps 5000 --folder runs/pendulum
+	$(BIN)/aarl train cartpole-balance --steps 20000 --folder runs/cartpole
 	$(BIN)/aarl train reacher-easy --steps 20000 --folder runs/reacher
 	$(BIN)/aarl train ball_in_cup-catch --steps 20000 --folder runs/catch
 
