@@ -511,8 +511,7 @@ class SACAux(SAC):
                 print(f"Learning starts after {self.learning_starts} steps with random actions")
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if self._n_updates and self._n_aux_skipped == self._n_updates:
-            message = f"the auxiliary loss was never trained: no episode is as long as its horizon ({self.aux_loss})"
-            warnings.warn(message, stacklevel=2)
+            warnings.warn(f"aux_loss was never trained: no episode is as long as its horizon ({self.aux_loss})", stacklevel=2)
         return self
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -116,7 +116,7 @@ def video(
     """Film an episode of a trained model, whose environment takes render_mode, at 30 pictures a second."""
     import imageio.v3 as imageio
 
-    path, frames = out or folder / "video.gif", list[Any]()
+    path, frames = out or (folder if folder.is_dir() else folder.parent) / "video.gif", list[Any]()
     returns = play(folder, 1, 0, frames)
     # GIF counts in milliseconds, and repeats.
     imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix.lower() == ".gif" else {"fps": FPS}))

@@ -193,7 +193,8 @@ def measure(run: Run) -> float:
 
 
 def load_trained(folder: Path, renders: bool = False) -> tuple[SACAux, VecEnv]:
-    """The model of a run's folder, and an environment for it, as that of the run."""
+    """The model of a run's folder (or the model's own path in it), and an environment for it, as that of the run."""
+    folder = folder.parent if folder.name == MODEL else folder
     if not (folder / MODEL).is_file():
         raise ValueError(f"{folder / MODEL} does not exist: name the folder of a run that has one, such as of aarl train")
     run = read_run(folder)
