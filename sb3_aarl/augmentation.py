@@ -58,7 +58,7 @@ def random_shift(images: th.Tensor, pad: int = 4) -> th.Tensor:
     :param pad: Largest shift in pixels
     """
     batch, _, height, width = images.shape
-    # Padding by replication knows no integers; pixels are exact in float32.
+    # Replicate padding does not support integers; pixels are exact in float32.
     padded = F.pad(images.float(), (pad,) * 4, mode="replicate").to(images.dtype)
     top, left = th.randint(2 * pad + 1, (2, batch), device=images.device)
     return cut(padded, th.arange(batch, device=images.device), top, left, height, width)

@@ -43,7 +43,7 @@ class AuxOptions:
         if not 0 <= self.coef < float("inf"):
             raise ValueError(f"aux_kwargs: coef must be a finite number of at least 0, not {self.coef}")
         if self.coef != 1 and not self.joint:
-            raise ValueError("aux_kwargs: coef has no effect without joint=True")
+            raise ValueError("aux_kwargs: coef needs joint=True; without it, set learning_rate")
 
 
 class AuxHead(nn.Module):

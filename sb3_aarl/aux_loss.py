@@ -164,7 +164,7 @@ class AuxLoss:
         """
         The same loss, shifted to start at t, with the smallest horizon.
 
-        Windows are drawn uniformly from an episode, so two losses with one canonical form are one loss.
+        Windows are drawn uniformly, so two losses with one canonical form are one loss, in episodes as long as both horizons.
         """
         chosen = [in_source or in_target for in_source, in_target in zip(self.source, self.target, strict=True)]
         first = chosen.index(True) // 3 * 3

@@ -139,7 +139,7 @@ class RunningNorm(nn.Module):
 
     Predictions and the actor, which read the encoder without gradients, leave the statistics as they are.
 
-    :param size: Numbers of an observation
+    :param size: Dimension of a flat observation
     """
 
     running_mean: th.Tensor
@@ -177,7 +177,8 @@ class SimbaEncoder(Encoder):
     observation, else through a projection of its own.
 
     :param observation_space: Any space that SB3 can flatten
-    :param features_dim: Width of the latent state and of all blocks; 128 was slower (results/agent/encoder_width)
+    :param features_dim: Width of all blocks, and of the latent state without the observation; 128 was slower
+        (results/agent/encoder_width)
     :param n_blocks: Number of residual blocks
     :param normalize: Whether observations are normalised; VecNormalize would do the same before
     :param observation: Whether the latent state contains the (normalised) observation beside the output of the blocks

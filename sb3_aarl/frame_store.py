@@ -106,14 +106,14 @@ class FrameStore:
             top, left = (th.randint(length - crop_size + 1, newest.shape) for length in self.frame_shape[1:])
             stacked = cut(frames, numbers, top[..., None], left[..., None], crop_size, crop_size)
         indices = np.broadcast_to(indices, newest.shape)
-        # Few are at an episode's end or start.
-        for index in map(tuple, np.argwhere(final).tolist()):
-            frame = th.as_tensor(self.final_frames[int(indices[index])])
+        if final.any():
+            last = th.from_numpy(np.stack([self.final_frames[index] for index in indices[final].tolist()]))
             if crop_size is not None:
-                frame = frame[:, top[index] : top[index] + crop_size, left[index] : left[index] + crop_size]
-            stacked[(*index, -1)] = frame
+                last = cut(last, th.arange(len(last)), top[final], left[final], crop_size, crop_size)
+            stacked.numpy()[final, -1] = last.numpy()  # PyTorch does not index all types of NumPy
         if self.stack == 1:
             return stacked.squeeze(newest.ndim)
+        # Few are at an episode's start.
         padded = (back > age[..., None]) & self.zero_padded.take(indices)[..., None]
         for index in map(tuple, np.argwhere(padded).tolist()):
             stacked[index] = 0

@@ -14,7 +14,7 @@ LARGEST_LOG_DENSITY = 34.0
 
 
 class NonFiniteError(FloatingPointError):
-    """An observation, reward, loss or parameter is NaN or infinite; the message names it and the step."""
+    """An observation, reward, loss or output of the actor is NaN or infinite; the message names it and the step."""
 
 
 class ExplodedError(FloatingPointError):

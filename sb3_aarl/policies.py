@@ -196,6 +196,7 @@ class Critic(_CropsImages, ContinuousCritic):
             for i in range(len(self.q_networks)):
                 self.q_networks[i] = q_network(norm, inputs, kwargs["net_arch"], kwargs["activation_fn"])
                 setattr(self, f"qf{i}", self.q_networks[i])
+        self.train()
 
     def trunk(self, obs: PyTorchObs) -> Trunk:
         """
@@ -225,6 +226,13 @@ class Critic(_CropsImages, ContinuousCritic):
         """
         inputs = th.cat([latent, actions], dim=1)
         return tuple(q_network(inputs).float() for q_network in self.q_networks)
+
+    def train(self, mode: bool = True) -> "Critic":
+        super().train(mode)
+        if self.norm == "batch":  # the statistics of a batch in the critic loss only
+            for network in self.q_networks:
+                network.eval()
+        return self
 
     @contextmanager
     def batch_statistics(self) -> Iterator[None]:

@@ -38,7 +38,7 @@ SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
 
 
 def _computes_bf16(device: th.device) -> bool:
-    """Whether a device has instructions for bfloat16; of x86 processors those with AVX-512."""
+    """Whether PyTorch is fast in bfloat16 on a device: of x86 processors on those with AVX-512."""
     if device.type == "cuda":
         return th.cuda.is_bf16_supported(including_emulation=False)
     return device.type != "cpu" or th.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
@@ -571,7 +571,7 @@ class SACAux(SAC):
             given = load_from_zip_file(given, device=device, load_data=False)[1]
         own, auxiliary = self.get_parameters(), {"aux_head", "aux_optimizer"}
         if _shapes(own.get("aux_head", {})) != _shapes(given.get("aux_head", {})):
-            logger.warning("parameters of another aux_loss, or of none: that of this model (%s) stays as it is", self.aux_loss)
+            logger.warning("no parameters of this model's aux_loss (%s) are given: its own stay as they are", self.aux_loss)
             given = {name: value for name, value in given.items() if name not in auxiliary}
             given |= {name: own[name] for name in auxiliary & own.keys()}
         key = "critic.optimizer"

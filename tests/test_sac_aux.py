@@ -635,7 +635,7 @@ def test_loading_without_the_loss_or_with_one(joint: bool, tmp_path: pathlib.Pat
             assert_same(dict(model.policy.state_dict()), dict(trained.policy.state_dict()))
             model.learn(30)
         messages = [record.getMessage() for record in caplog.records]
-        kept = f"that of this model ({given.aux_loss}) stays as it is"
+        kept = f"this model's aux_loss ({given.aux_loss}) are given: its own stay as they are"
         assert len(messages) == 2 and all(kept in message for message in messages)
         caplog.clear()
 
@@ -764,7 +764,7 @@ def test_augmentation_is_saved(argument: dict[str, Any], tmp_path: pathlib.Path)
         ("state", {"aux_kwargs": {"tua": 0.1}}, r"aux_kwargs: an unexpected .*'tua'"),
         ("state", {"aux_kwargs": {"tau": "0.1"}}, r"aux_kwargs: .* not supported .*'str'"),
         ("state", {"aux_kwargs": {"coef": math.nan}}, r"aux_kwargs: coef must be a finite number of at least 0, not nan"),
-        ("state", {"aux_kwargs": {"coef": 2}}, r"aux_kwargs: coef has no effect without joint=True"),
+        ("state", {"aux_kwargs": {"coef": 2}}, r"aux_kwargs: coef needs joint=True"),
         ("state", {"precision": "fp16"}, r"precision must be fp32 or bf16, not 'fp16'"),
         (
             "state",

@@ -534,13 +534,6 @@ def test_scores_that_are_too_large_for_the_surrogate_choose_parents() -> None:
     assert filled_slots(run(make_study(**settings), lambda loss: 1e200 * score(loss))) == all_slots(12, 12, 2)
 
 
-class Half(optuna.samplers.RandomSampler):
-    """Not random at all."""
-
-    def sample_independent(self, *arguments: Any) -> Any:
-        return 0.5
-
-
 def test_other_parameters_are_inherited_or_left_to_another_sampler() -> None:
     def rates(**settings: Any) -> tuple[list[float], list[set[float]]]:
         """Of the offspring, and of the parents of each."""
@@ -548,6 +541,7 @@ def test_other_parameters_are_inherited_or_left_to_another_sampler() -> None:
         while sampler_of(study).free_slots(study):
             trial = study.ask()
             trial.suggest_float("rate", 0, 1)
+            trial.suggest_categorical("operator", ["adam", "sgd"])  # the user's own, not the loss's
             study.tell(trial, score(suggest_aux_loss(trial)))
         offspring = [trial for trial in study.trials if trial.user_attrs["parents"]]
         of_parents = [{study.trials[number].params["rate"] for number in trial.user_attrs["parents"]} for trial in offspring]
@@ -556,7 +550,8 @@ def test_other_parameters_are_inherited_or_left_to_another_sampler() -> None:
     inherited, of_parents = rates()
     is_kept = [rate in parents for rate, parents in zip(inherited, of_parents, strict=True)]
     assert len(inherited) == 40 and 10 < sum(is_kept) < 30
-    assert set(rates(independent_sampler=Half())[0]) == {0.5}
+    grid = {"rate": [i / 100 for i in range(100)], "operator": ["adam", "sgd"]}
+    assert set(rates(independent_sampler=optuna.samplers.GridSampler(grid))[0]) <= {*grid["rate"]}
 
 
 def test_trials_may_be_pruned_before_the_loss_and_its_parameters_fixed() -> None:

@@ -1,4 +1,4 @@
-"""The paper's mutations of a loss (section 2.2, figure 3, A.3), and of other parameters. A ValueError: to be redrawn."""
+"""The paper's mutations of a loss (section 2.2, figure 3, A.3), and of other parameters. A ValueError means: draw again."""
 
 from collections.abc import Sequence
 from typing import Any

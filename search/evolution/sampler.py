@@ -51,15 +51,16 @@ class AuxLossSampler(Settings, BaseSampler):
     shares. It is over when it has as many complete or pruned trials as slots; the random slots of the next one come before.
 
     A trial gets its slot when it is asked for, and shows it in its user attributes ``generation``, ``slot``, ``attempt``,
-    ``operation`` and ``parents``. Its loss depends on the seed, the slot and earlier generations, not on the number of trials
-    that run at once. A failed trial, or one that is pruned before it has a loss, frees its slot for another candidate; for the
-    same one if it has the user attribute ``interrupted``. Enqueued parameters of a loss take a random slot if there is one.
+    ``operation`` and ``parents``. Its loss depends on the seed, the slot and earlier generations, and as long as no more
+    trials are asked for than ``free_slots`` says, not on how many run at once. A failed trial, or one that is pruned before it
+    has a loss, frees its slot for another candidate; for the same one if it has the user attribute ``interrupted``. Enqueued
+    parameters of a loss take a random slot if there is one.
 
     Trials that are pruned, have no finite score or violate a constraint (``trial.set_constraint``) are parents only if there
     are no others. What is searched beside the loss is inherited from a parent and, every other time, changed. Other samplers
     may hold this one (``PartialFixedSampler``, ``independent_sampler``): the loss of a trial is the one of its parameters.
 
-    Asking never waits. A trial that finds no free slot gets an extra one, with one more offspring of the last parents, so that
+    Asking never waits. A trial that finds no free slot gets an extra one, as the next generation would have it, so that
     no generation waits for trials that a killed process left RUNNING. Two processes that ask at the same moment may train one
     slot's loss twice; the trial that finishes first counts.
 
@@ -125,8 +126,8 @@ class AuxLossSampler(Settings, BaseSampler):
     @staticmethod
     def seed_index(trial: Trial | FrozenTrial) -> int:
         """
-        Which seed a trial trains: 0, or k if it repeats a loss for the k-th time. Train other seeds for each; it is the user
-        attribute ``seed_index``.
+        Which seed a trial trains: k if ``again`` repeats its loss for the k-th time, else 0. Train other seeds for each; it is
+        the user attribute ``seed_index``.
         """
         return trial.user_attrs.get(SEED_INDEX_KEY, 0)
 
@@ -138,6 +139,8 @@ class AuxLossSampler(Settings, BaseSampler):
     # Optuna's interface.
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
+        if self.independent_sampler is not None:
+            self.independent_sampler.before_trial(study, trial)
         fixed = {**trial.params, **trial.system_attrs.get(FIXED_KEY, {})}
         self._assign(study, trial, is_enqueued=not self._space.keys().isdisjoint(fixed))
 
@@ -153,6 +156,14 @@ class AuxLossSampler(Settings, BaseSampler):
                 study._storage.set_trial_user_attr(trial._trial_id, key, assigned[SLOT_KEY][key])
                 trial.user_attrs[key] = assigned[SLOT_KEY][key]
         return trial.system_attrs[SLOT_KEY]
+
+    def after_trial(self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None) -> None:
+        if self.independent_sampler is not None:
+            self.independent_sampler.after_trial(study, trial, state, values)
+
+    def reseed_rng(self) -> None:
+        if self.independent_sampler is not None:  # the evolution draws from its stored seed
+            self.independent_sampler.reseed_rng()
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         return dict(self._space)

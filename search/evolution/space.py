@@ -81,7 +81,9 @@ def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
     """
     horizon = params["horizon"]
     source, target = (tuple(params[name] for name in names) for names in token_names(horizon))
-    return AuxLoss(int(horizon), source, target, params.get("operator", "mse"), params.get("negatives", False))
+    # Without negatives beside it, an "operator" is a parameter of the user's own.
+    operator = params["operator"] if "negatives" in params else "mse"
+    return AuxLoss(int(horizon), source, target, operator, params.get("negatives", False))
 
 
 def loss_of(trial: FrozenTrial) -> AuxLoss | None:

@@ -109,8 +109,8 @@ class TokenModel:
     @one_thread
     def higher(self, loss: AuxLoss, optimism: float) -> Iterator[AuxLoss]:
         """
-        The losses with one token more or less, and some in the first step, that are rated higher, the best first. A rating
-        is the mean of the posterior and ``optimism`` times its deviation, without the part of each loss alone.
+        The losses with one token more or less, and at least one in the first step, that are rated higher, the best first. A
+        rating is the mean of the posterior and ``optimism`` times its deviation, without the part of each loss alone.
         """
         point = features([loss], self.max_horizon)
         tokens = point[0, : -len(OPERATORS) - 1] > 0

@@ -138,7 +138,8 @@ _Evolution: Any = create_model("_Evolution", **_KEYS)
 
 class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
     """
-    A search. Defaults are the paper's. Arguments of ``AuxLossSampler``, from ``population_size`` to ``again``, are keys too.
+    A search. Defaults are the paper's, except that no loss is trained twice. Arguments of ``AuxLossSampler``, from
+    ``population_size`` to ``again``, are keys too.
 
     :param path: The file that it was read from
     :param imports: Modules that are imported first, such as those that register environments
@@ -192,7 +193,7 @@ class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
     @classmethod
     def _one_or_several(cls, environment: str | None, info: ValidationInfo) -> str | None:
         if (environment is None) != bool(info.data.get("environments", True)):
-            raise ValueError("is missing" if environment is None else "environments is there too: keep one of them")
+            raise ValueError("is missing" if environment is None else "set either environment or environments")
         return environment
 
     @field_validator("hyperparameters")

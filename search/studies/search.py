@@ -86,7 +86,7 @@ def _suggest(trial: optuna.Trial, name: str, distribution: Any) -> Any:
 
 
 def planned_runs(config: SearchConfig) -> dict[str, list[Run]]:
-    """As many runs as a search without failures has, by kind and environment, all with one loss, to estimate the cost."""
+    """The runs of a search without failures, by kind and environment, all with one loss, to estimate the cost."""
     operations, section = AuxLossSampler(**config.sampler_settings()).operations, config.cross_validation
     n_slots = sum(len(operations(number + 1)) for number in range(config.generations))
     kinds: list[Any] = [(config.name, n_slots * len(config.seeds), config.tasks, {})]
