@@ -575,8 +575,8 @@ class SACAux(SAC):
             given = {name: value for name, value in given.items() if name not in auxiliary}
             given |= {name: own[name] for name in auxiliary & own.keys()}
         key = "critic.optimizer"
-        old, new = ([group["params"] for group in state[key]["param_groups"]] for state in (own | given, own))
-        if old != new:
+        groups = given.get(key, {}).get("param_groups", own[key]["param_groups"])
+        if [group["params"] for group in groups] != [group["params"] for group in own[key]["param_groups"]]:
             # With aux_kwargs=dict(joint=True) the auxiliary optimizer has the encoder's part of the state.
             given = {**given, key: own[key]}
         super().set_parameters(given, exact_match, device)
