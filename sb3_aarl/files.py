@@ -3,6 +3,8 @@
 import json
 import re
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +65,20 @@ def replace_text(path: Path, text: str) -> None:
     :param text: All of its text
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
+    with replacing(path, path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")) as unfinished:
         unfinished.write_text(text, encoding="utf-8", newline="")
+
+
+@contextmanager
+def replacing(path: Path, unfinished: Path) -> Iterator[Path]:
+    """
+    Replace a file in one step by one that is written meanwhile.
+
+    :param path: The file
+    :param unfinished: Where it is written. Nothing is left there if that fails: a full disk has room for the reason again
+    """
+    try:
+        yield unfinished
         unfinished.replace(path)
     finally:
-        unfinished.unlink(missing_ok=True)  # what is left of it on a full disk
+        unfinished.unlink(missing_ok=True)

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_aarl import SACAux
 from sb3_aarl.buffers import WindowReplayBuffer
 from sb3_aarl.callbacks import Evaluation
+from sb3_aarl.files import replacing
 
 CHECKPOINT = "checkpoint.pt"
 UNFINISHED = "checkpoint.tmp"
@@ -68,16 +69,13 @@ def save(folder: Path, model: SACAux, curve: Sequence[Evaluation]) -> None:
         "curve": [list(evaluation) for evaluation in curve],
     }
     try:
-        with (folder / UNFINISHED).open("wb") as file:
+        with replacing(folder / CHECKPOINT, folder / UNFINISHED) as unfinished, unfinished.open("wb") as file:
             th.save(state, file)
             file.flush()
             os.fsync(file.fileno())
-        (folder / UNFINISHED).replace(folder / CHECKPOINT)
     except RuntimeError as error:
         # PyTorch closes its archive, which fails too, and hides the error of the disk.
         raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
-    finally:
-        (folder / UNFINISHED).unlink(missing_ok=True)  # what is left of it on a full disk: the reason needs room
 
 
 def read(folder: Path) -> dict[str, Any] | None:

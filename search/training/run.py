@@ -33,7 +33,7 @@ from sb3_aarl.search.training.setup import Setup, check_run
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, write_curve
-from sb3_aarl.files import replace_text
+from sb3_aarl.files import replace_text, replacing
 
 # What is needed to train a run from Python.
 __all__ = ["Run", "check_run", "prepare_run", "train"]
@@ -99,14 +99,10 @@ def _train(folder: Path, run: Run, on_evaluation: Callable[[list[Evaluation]], o
         model.learn(setup.agent_steps, [evaluations, checkpoints])
         if not checkpoints.stopped:
             if run.keep_model:
-                unfinished = folder / f"unfinished-{MODEL}"
-                try:
+                with replacing(folder / MODEL, folder / f"unfinished-{MODEL}") as unfinished:
                     model.save(unfinished)
                     if isinstance(env, VecNormalize):
                         env.save(str(folder / NORMALIZE))
-                    unfinished.replace(folder / MODEL)
-                finally:
-                    unfinished.unlink(missing_ok=True)  # what is left of it on a full disk
             write_about(folder, {**read_about(folder), "seconds": evaluations.curve[-1].seconds})
             report()
 
