@@ -22,7 +22,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = {path.relative_to(ROOT).as_posix(): path for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]}
 LANGUAGES = {"python", "bash", "yaml", "text"}
 # What takes long, and what is put in its place.
-SHORTER = {r"learn\([\d_]+": "learn(150", r"eval_freq=[\d_]+": "eval_freq=100", r"pendulum\.yml": "small.yml"}
+SHORTER = {r"learn\([\d_]+": "learn(60", r"eval_freq=[\d_]+": "eval_freq=50", r"pendulum\.yml": "small.yml"}
 
 
 def blocks(page: str) -> list[tuple[str, str]]:
@@ -45,7 +45,7 @@ def test_every_block_is_of_a_known_language() -> None:
 def test_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The blocks of a page, one after the other, in a folder with a small search."""
     text = re.sub(r"(generations|n_random|population_size): \d", r"\1: 1", SEARCH).replace("n_prior: 1", "n_prior: 0")
-    write_search(tmp_path, f"{text.replace('200, 400', '100, 200')}baselines: [{{name: SAC}}]\n")
+    write_search(tmp_path, f"{text.replace('200, 400', '50, 100')}baselines: [{{name: SAC}}]\n")
     code = "\n".join(text for name, text in blocks(page) if name == "python")
     for pattern, replacement in SHORTER.items():
         code = re.sub(pattern, replacement, code, flags=re.MULTILINE)

@@ -12,7 +12,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 # What each prints at its end.
 LAST = {
     "sac_to_sac_aux": "SACAux: -",
-    "pixels": "after 230 steps:",
+    "pixels": "after 110 steps:",
     "own_encoder_and_loss": "mean return: -",
     "search_from_python": "Best: {",
 }
@@ -30,7 +30,7 @@ def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
     monkeypatch.syspath_prepend(EXAMPLES)
     monkeypatch.setenv("PYTHONPATH", "")  # which one of them sets
     monkeypatch.setattr("sb3_aarl.search.execution.executors.LocalExecutor", OneProcess)
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--steps", "230"])
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--steps", "110"])
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     assert capsys.readouterr().out.splitlines()[-1].startswith(LAST[name])
 
@@ -38,7 +38,7 @@ def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
 @pytest.mark.slow
 def test_notebook(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """The code cells, one after the other, with few steps."""
-    monkeypatch.setenv("STEPS", "200")
+    monkeypatch.setenv("STEPS", "80")
     monkeypatch.setenv("MPLBACKEND", "agg")
     cells = json.loads((EXAMPLES / "from_sac_to_sac_aux.ipynb").read_text(encoding="utf-8"))["cells"]
     names: dict[str, object] = {}
