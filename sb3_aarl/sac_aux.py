@@ -379,11 +379,13 @@ class SACAux(SAC):
         """Half the sum of the critics' mean squared errors, as in SB3."""
         latent = self.critic.encode(trunk)
         with th.no_grad():
-            next_actions, next_log_prob = self._act(batch.next_observations)
+            shared = self.policy.share_features_extractor
+            next_trunk = self.critic.trunk(batch.next_observations) if shared else batch.next_observations
+            next_actions, next_log_prob = self._act(next_trunk)
         if self.critic.norm == "batch":
             # CrossQ: both states in one batch, so that batch norm sees what it is used on; no target Q networks.
             with th.no_grad():
-                next_latent = self.critic.encode(batch.next_observations)
+                next_latent = self.critic.encode(next_trunk)
             with self.critic.batch_statistics():
                 both = self.critic.q_values(th.cat([latent, next_latent]), th.cat([batch.actions, next_actions]))
             q_values, next_q_values = zip(*(q.chunk(2) for q in both), strict=True)
