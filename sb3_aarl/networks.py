@@ -1,10 +1,17 @@
-"""Layers that encoders, actor and critics share."""
+"""Layers that encoders, actor and critics share, and where they can compute in bfloat16."""
 
 import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
 CRITIC_NORMS = (None, "layer", "batch")
+
+
+def computes_bf16(device: th.device) -> bool:
+    """Whether PyTorch is fast in bfloat16 on a device: of x86 processors on those with AVX-512."""
+    if device.type == "cuda":
+        return th.cuda.is_bf16_supported(including_emulation=False)
+    return device.type != "cpu" or th.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
 
 
 def orthogonal_init(module: nn.Module) -> None:

@@ -28,6 +28,7 @@ from sb3_aarl.aux_head import AuxHead, AuxOptions
 from sb3_aarl.aux_loss import AuxLoss
 from sb3_aarl.buffers import NoWindowError, WindowReplayBuffer, WindowSamples, detect_frame_stack
 from sb3_aarl.health import NonFiniteError, QValueCheck, check_finite
+from sb3_aarl.networks import computes_bf16
 from sb3_aarl.policies import Actor, CnnPolicy, Critic, MultiInputPolicy, SACAuxPolicy, Trunk
 
 logger = logging.getLogger(__name__)
@@ -35,13 +36,6 @@ logger = logging.getLogger(__name__)
 COMPILED = ("_act", "_critic_loss", "_aux_loss")
 
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
-
-
-def _computes_bf16(device: th.device) -> bool:
-    """Whether PyTorch is fast in bfloat16 on a device: of x86 processors on those with AVX-512."""
-    if device.type == "cuda":
-        return th.cuda.is_bf16_supported(including_emulation=False)
-    return device.type != "cpu" or th.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
 
 
 def _shapes(parameters: Mapping[str, th.Tensor]) -> dict[str, th.Size]:
@@ -79,7 +73,8 @@ class SACAux(SAC):
         was detected does not hold, a warning is raised and whole observations are stored
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns; None (default) for 3, and for 1 with a buffer that is no WindowReplayBuffer
-    :param ent_coef: As in SB3; ``"auto_0.01"`` (default) learns it from 0.01 on
+    :param ent_coef: As in SB3; None (default) learns it, from 0.01 on, or from a hundredth of the mean magnitude of the first
+        batch's rewards if that is more
     :param target_entropy: As in SB3; ``"auto_0.5"`` (default) is half of what ``"auto"`` is
     :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
     :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``
@@ -129,7 +124,7 @@ class SACAux(SAC):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int | None = None,
-        ent_coef: str | float = "auto_0.01",
+        ent_coef: str | float | None = None,
         target_update_interval: int = 1,
         target_entropy: str | float = "auto_0.5",
         use_sde: bool = False,
@@ -165,7 +160,7 @@ class SACAux(SAC):
             replay_buffer_kwargs,
             optimize_memory_usage,
             n_steps,  # type: ignore[arg-type]
-            ent_coef,
+            "auto_0.01" if ent_coef is None else ent_coef,
             target_update_interval,
             target_entropy,
             use_sde,
@@ -179,6 +174,7 @@ class SACAux(SAC):
             device,
             _init_setup_model=False,
         )
+        self._ent_coef_follows_rewards = ent_coef is None
         self.aux_loss = aux_loss
         self.aux_kwargs = aux_kwargs
         self.policy_delay = policy_delay
@@ -227,7 +223,7 @@ class SACAux(SAC):
             kwargs = {"lr": self.lr_schedule(1), **self.ent_coef_optimizer_kwargs}
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], **kwargs)
         self._setup_aux_loss()
-        if self.precision == "bf16" and not _computes_bf16(self.device):
+        if self.precision == "bf16" and not computes_bf16(self.device):
             logger.warning("precision='bf16': this %s has no instructions for it, training in fp32", self.device.type.upper())
         if self.compile:
             self._compile_losses()
@@ -310,7 +306,7 @@ class SACAux(SAC):
         self.policy.set_training_mode(True)
         self._update_learning_rates()
         # Networks compute in bfloat16 if asked to; their outputs, and all that is computed from them, are float32.
-        bf16 = self.precision == "bf16" and _computes_bf16(self.device)
+        bf16 = self.precision == "bf16" and computes_bf16(self.device)
         autocast = th.autocast(self.device.type, th.bfloat16, enabled=bf16)
         with self._logged() as log, self._actor_checked():
             for _ in range(gradient_steps):
@@ -318,6 +314,9 @@ class SACAux(SAC):
                 update_actor = self._n_updates % self.policy_delay == 0
                 batch, windows = self._sample(batch_size)
                 log("largest_reward", batch.rewards.abs().max())
+                if self._n_updates == 1 and self._ent_coef_follows_rewards and self.log_ent_coef is not None:
+                    # Else Pendulum's rewards, up to 16, let actions saturate before the coefficient has grown.
+                    self.log_ent_coef.data += (batch.rewards.abs().mean() / self.n_steps).clamp(min=1).log()
                 if self.use_sde:
                     self.actor.reset_noise()
 
@@ -509,8 +508,6 @@ class SACAux(SAC):
             self._last_obs = None
         if self.learning_starts is None:
             self.learning_starts = default_learning_starts(total_timesteps)
-            if self.verbose >= 1:
-                print(f"Learning starts after {self.learning_starts} steps with random actions")
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if self._n_updates and self._n_aux_skipped == self._n_updates:
             warnings.warn(f"aux_loss was never trained: no episode is as long as its horizon ({self.aux_loss})", stacklevel=2)

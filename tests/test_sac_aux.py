@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TransformReward
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
@@ -94,6 +95,7 @@ def make_model(
         "batch_size": 16,
         "n_steps": 1,
         "policy_delay": 2,
+        "ent_coef": "auto_0.01",
         "target_entropy": "auto",
         "aux_loss": LOSS,
         "seed": 3,
@@ -523,6 +525,21 @@ def test_defaults_that_depend_on_run_and_actions() -> None:
     assert (model.learning_starts, model._n_updates) == (6, 54)  # a tenth of a short run
     assert default_learning_starts(10**6) == 5000
     assert model.target_entropy == -1.0  # half of SAC's, which is -2 for two actions
+
+
+@pytest.mark.parametrize(
+    ("reward", "given", "expected"), [(30, None, 0.3), (0.5, None, 0.01), (30, "auto_0.2", 0.2), (30, 0.4, 0.4)]
+)
+def test_the_entropy_coefficient_starts_at_the_magnitude_of_the_rewards(
+    reward: float, given: float | str | None, expected: float, tmp_path: pathlib.Path
+) -> None:
+    env = TransformReward(Point(length=1000), lambda _: -reward)
+    model = make_model(env=env, ent_coef=given, n_steps=3, gamma=1.0, learning_starts=50).learn(50)
+    model.save(tmp_path / "model")
+    model = SACAux.load(tmp_path / "model", env)
+    for _ in range(2):  # once in a training
+        model.learn(51)
+        assert model.logger.name_to_value["train/ent_coef"] == pytest.approx(expected, rel=0.01)
 
 
 # --- Save and load -----------------------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ def test_without_instructions_for_bfloat16_trains_in_fp32_with_a_warning(
 @pytest.fixture
 def computes_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bfloat16 on any processor, if slowly."""
-    monkeypatch.setattr(sac_aux, "_computes_bf16", lambda device: True)
+    monkeypatch.setattr(sac_aux, "computes_bf16", lambda device: True)
 
 
 @pytest.mark.usefixtures("computes_bf16")
