@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim, is_image_space, preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor as SB3Actor
 from stable_baselines3.sac.policies import SACPolicy
@@ -317,6 +317,8 @@ class SACAuxPolicy(SACPolicy):
         self.ortho_init = ortho_init
         self.critic_norm = critic_norm
         encoder = encoder_class(features_extractor_class or self.default_encoder)
+        if encoder is FlattenExtractor and isinstance(observation_space, spaces.Dict):
+            encoder = CombinedExtractor  # SB3's for Dicts: vectors as they are, beside each other
         if issubclass(encoder, MultiInputEncoder) and not normalize_images:
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
         # As SB3's NatureCNN: floats that are not scaled are mostly a mistake.

@@ -16,11 +16,12 @@ from filelock import FileLock, Timeout
 from hypothesis import given
 from hypothesis import strategies as st
 from sb3_aarl.search.training import run as module
-from sb3_aarl.search.training.config import ConfigError, spread_checkpoints
+from sb3_aarl.search.training.config import ConfigError, load_hyperparameters, spread_checkpoints
 from sb3_aarl.search.training.folder import Outcome, is_finished, read_outcome
 from sb3_aarl.search.training.provenance import read_about, write_about
 from sb3_aarl.search.training.run import Run, check_run, prepare_run, train
 from sb3_aarl.search.training.setup import Setup, make_env
+from sb3_aarl.search.training.shipped import find_file
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import DENSE
@@ -414,6 +415,19 @@ def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None
     with pytest.raises(ConfigError, match=message) as error:
         check_run(make_run(**changes), "own.yml")
     assert str(error.value).startswith("own.yml: ") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["sac", "sac_aux"])
+def test_shipped_files_train_on_dicts_too(name: str) -> None:
+    settings = load_hyperparameters(find_file(Path(name)), "WalkInParts-v0")
+    check_run(make_run(environment="WalkInParts-v0", aux_loss=settings.pop("aux_loss", "auto"), hyperparameters=settings))
+
+
+def test_an_error_of_an_environment_names_its_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("oops.py").write_text(EXITS.replace("Exits", "Oops").replace("os._exit(3)", "raise KeyError('speed')"))
+    with pytest.raises(ConfigError, match=r"^Oops-v0 raised KeyError: 'speed' \(.*oops.py, line 12\)$"):
+        check_run(make_run(environment="Oops-v0", imports=("oops",)), "own.yml")
 
 
 def test_a_run_is_tried_out_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from gymnasium.wrappers import TransformReward
+from gymnasium.wrappers import TransformObservation, TransformReward
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
@@ -169,6 +169,16 @@ def test_without_aux_loss_is_sac(n_envs: int, settings: dict[str, Any]) -> None:
     settings = {"policy_kwargs": {"net_arch": [16]}, **settings}
     sac, ours = sac_and_ours("MlpPolicy", pendulum, 60 * n_envs + 10, identity, **settings)
     assert ours._n_updates == sac._n_updates >= 45
+    assert_same(everything(ours), everything(sac))
+
+
+def test_without_aux_loss_is_sac_on_dicts() -> None:
+    def pendulum() -> gym.Env:
+        space = spaces.Dict({"angle": spaces.Box(-1, 1, (2,)), "speed": spaces.Box(-8, 8, (1,))})
+        return TransformObservation(gym.make("Pendulum-v1"), lambda x: {"angle": x[:2], "speed": x[2:]}, space)
+
+    identity = {"policy_kwargs": {"features_extractor_class": "identity"}}
+    sac, ours = sac_and_ours("MultiInputPolicy", pendulum, 60, identity, policy_kwargs={"net_arch": [16]})
     assert_same(everything(ours), everything(sac))
 
 

@@ -5,6 +5,7 @@ import inspect
 import logging
 import math
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -115,11 +116,11 @@ class Setup:
         return env if self.normalize is None else VecNormalize(env, **{**self.normalize, **FIXED})
 
     def model(self, env: VecEnv) -> SACAux:
-        policy = "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
-        if isinstance(env.observation_space, spaces.Dict):
+        policy = self.policy or ("CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy")
+        if isinstance(env.observation_space, spaces.Dict):  # for which there is one policy only
             policy = "MultiInputPolicy"
         learning_starts = default_learning_starts(self.agent_steps)
-        return SACAux(self.policy or policy, env, **{"learning_starts": learning_starts, **self.settings})
+        return SACAux(policy, env, **{"learning_starts": learning_starts, **self.settings})
 
 
 def _with_schedules(value: Any) -> Any:
@@ -149,6 +150,8 @@ def check_run(run: Run, source: str | None = None) -> Setup:
     except ConfigError:
         raise
     except Exception as error:  # Gymnasium, SB3 and PyTorch have errors of all kinds
+        if place := _place(error, run.imports):
+            raise ConfigError(f"{run.environment} raised {one_line(error)} ({place})") from error
         raise ConfigError(f"{what}: {one_line(error)}") from error
     horizon = model.aux_loss.horizon * setup.action_repeat if isinstance(model.aux_loss, AuxLoss) else 0
     if setup.episode_steps is not None and setup.episode_steps < horizon:
@@ -164,6 +167,14 @@ def check_run(run: Run, source: str | None = None) -> Setup:
         message = "evaluations every %d environment steps truncate episodes, which have up to %d steps"
         logger.warning(message, interval // setup.n_envs, setup.episode_steps)
     return setup
+
+
+def _place(error: Exception, imports: Sequence[str]) -> str:
+    """File and line of a user's own modules at which an error was raised, or nothing."""
+    own = {name.partition(".")[0] for name in imports}
+    frames = traceback.walk_tb(error.__traceback__)
+    lines = [(frame, line) for frame, line in frames if str(frame.f_globals.get("__name__")).partition(".")[0] in own]
+    return f"{lines[-1][0].f_code.co_filename}, line {lines[-1][1]}" if lines else ""
 
 
 def try_out(model: SACAux) -> None:
