@@ -3,10 +3,12 @@
 import json
 import re
 import shutil
+import socket
 import subprocess
 import sys
 from configparser import ConfigParser
 from pathlib import Path
+from unittest.mock import Mock
 
 import optuna
 import pytest
@@ -196,6 +198,21 @@ def test_a_missing_extra_is_named(folder: Path, executor: Planted, monkeypatch: 
     monkeypatch.delitem(sys.modules, "sb3_aarl.search.execution.ray", raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
     assert "pip install 'sb3-aarl[ray]'" in run("search", "small.yml", "--executor", "ray", code=2)
+
+
+def test_a_ray_that_does_not_answer_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray")
+    write_search(folder)
+    monkeypatch.setattr(ray, "init", Mock(side_effect=ConnectionError("No Ray instance. Please specify --address")))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    for address, message in {
+        f"127.0.0.1:{port}": f"no Ray cluster answers at 127.0.0.1:{port}: is it started with `ray start --head`?",
+        "127.0.0.1": "--ray-address is auto or host:port, such as 192.0.2.2:6379, not 127.0.0.1",
+        "auto": "--ray-address auto: No Ray instance\n",
+    }.items():
+        assert message in run("search", "small.yml", "--executor", "ray", "--ray-address", address, code=2)
+    assert not Path("runs").exists()
 
 
 @pytest.mark.slow
