@@ -3,10 +3,12 @@
 import json
 import re
 import shutil
+import socket
 import subprocess
 import sys
 from configparser import ConfigParser
 from pathlib import Path
+from unittest.mock import Mock
 
 import optuna
 import pytest
@@ -15,6 +17,7 @@ from executors import Planted
 from optuna.trial import TrialState, create_trial
 from sb3_aarl.search.cli.main import app
 from sb3_aarl.search.evolution.space import distributions, loss_to_params
+from sb3_aarl.search.execution.queue import Queue
 from sb3_aarl.search.execution.storage import open_storage
 from sb3_aarl.search.studies.search import Search
 from sb3_aarl.search.training.shipped import ZOO
@@ -197,6 +200,21 @@ def test_a_missing_extra_is_named(folder: Path, executor: Planted, monkeypatch: 
     assert "pip install 'sb3-aarl[ray]'" in run("search", "small.yml", "--executor", "ray", code=2)
 
 
+def test_a_ray_that_does_not_answer_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray")
+    write_search(folder)
+    monkeypatch.setattr(ray, "init", Mock(side_effect=ConnectionError("No Ray instance. Please specify --address")))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    for address, message in {
+        f"127.0.0.1:{port}": f"no Ray cluster answers at 127.0.0.1:{port}: is it started with `ray start --head`?",
+        "127.0.0.1": "--ray-address is auto or host:port, such as 192.0.2.2:6379, not 127.0.0.1",
+        "auto": "--ray-address auto: No Ray instance\n",
+    }.items():
+        assert message in run("search", "small.yml", "--executor", "ray", "--ray-address", address, code=2)
+    assert not Path("runs").exists()
+
+
 @pytest.mark.slow
 def test_search_reports_progress_and_resumes(folder: Path, executor: Planted) -> None:
     write_search(folder, SMALLER)
@@ -216,11 +234,12 @@ def test_search_reports_progress_and_resumes(folder: Path, executor: Planted) ->
 @pytest.mark.slow
 def test_a_search_on_ray_fills_its_cluster(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray")
-    write_search(folder, SMALLER)
+    write_search(folder, SMALLER + "cross_validation: {environments: [Pendulum-v1]}\n")
     monkeypatch.setattr("sb3_aarl.search.execution.ray.RayExecutor", executor)
-    options = "--executor ray --ray-address host:1 --cpus-per-run 2 --gpus-per-run 0.25 --generations 1"
-    run("search", "small.yml", *options.split())
+    options = "--executor ray --ray-address host:1 --cpus-per-run 2 --gpus-per-run 0.25"
+    output = run("search", "small.yml", *options.split(), "--generations", 1)
     assert executor.arguments == ("host:1", 2.0, 0.25) and len(executor.runs) == 2
+    assert output.endswith(f"aarl cross-validate small.yml {options}\n")
 
 
 def test_a_search_on_slurm_passes_parameters(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -308,6 +327,18 @@ def test_baselines(folder: Path, executor: Planted) -> None:
     assert re.search(r"SAC\W+1\.500 .* 1\.000\W+2 ", output)
     assert output.splitlines()[-1] == "Failed: CURL on Pendulum-v1, seed 1: it burst"
     assert len(read_curve(Path("runs/small/baselines/SAC/Pendulum-v1/seed-1/curve.csv"))) == 2
+
+
+def test_baselines_on_ray_fill_its_cluster(folder: Path, executor: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray")
+    write_search(folder, MATRICES)
+    options = ["--executor", "ray", "--ray-address", "host:1", "--cpus-per-run", 2]
+    assert "--slurm has no meaning" in run("baselines", "small.yml", *options, "--slurm", "mem_gb=4", code=2)
+    monkeypatch.setattr("sb3_aarl.search.execution.ray.RayExecutor", executor)
+    workers: list[int] = []
+    monkeypatch.setattr("sb3_aarl.search.execution.matrix.Queue", lambda *args: workers.append(args[1]) or Queue(*args))
+    run("baselines", "small.yml", *options)
+    assert executor.arguments == ("host:1", 2, 0) and len(executor.runs) == 4 and workers == [4]
 
 
 def test_baselines_and_other_environments_are_tried_out(folder: Path, executor: Planted, searched: optuna.Study) -> None:

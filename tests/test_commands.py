@@ -1,5 +1,6 @@
 """Commands around a search and a run: shipped files by name, costs, status; evaluation and video of a model."""
 
+import logging
 import re
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 import sb3_aarl.search.cli.console
 from executors import Planted
 from optuna.samplers import BaseSampler, RandomSampler
+from rich.console import Console
 from sb3_aarl.search.cli.main import app
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import suggest_aux_loss
@@ -197,6 +199,7 @@ def test_status_of_a_study_made_in_python(sampler: BaseSampler) -> None:
     study = optuna.create_study(
         storage=open_storage(Path("runs/own")), sampler=sampler, direction="maximize", study_name="own"
     )
+    assert "None" not in run("status", "own")
     study.optimize(objective, 40, catch=ValueError, callbacks=[lambda study, trial: trial.value is None or study.stop()])
     shown = run("status", "own")
     progress = re.search(r"generation 1: (\d+)/\d+ done, 0 running, (\d+) failed", shown)
@@ -224,6 +227,16 @@ def test_a_log_has_a_line_for_each_change(capsys: pytest.CaptureFixture[str]) ->
             show(f"{done} done, 0:01:00 to go", done)
     lines = [line.partition(" ")[2] for line in capsys.readouterr().err.splitlines()]
     assert lines == ["1 done, 0:01:00 to go", "2 done, 0:01:00 to go"]
+
+
+def test_messages_are_above_the_progress(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sb3_aarl.search.cli.console, "errors", Console(stderr=True, force_terminal=True))
+    with sb3_aarl.search.cli.console.live() as show:
+        show("1 done", 1)
+        for _ in range(2):  # the second one takes the place of the progress
+            sb3_aarl.search.cli.console.Messages().handle(logging.makeLogRecord({"msg": "runs/[a] is resubmitted"}))
+    assert "\x1b[2Kruns/[a] is resubmitted\n" in capsys.readouterr().err
 
 
 def test_the_version() -> None:

@@ -100,7 +100,7 @@ def test_commands_are_there(page: str, line: str, tmp_path: Path, monkeypatch: p
     elif words[:2] == ["-m", "sb3_aarl.rl_zoo"]:
         assert words[2] in rl_zoo.PROGRAMS
     else:
-        assert program in ("cd", "git", "python", "docker"), "no test knows this program"
+        assert program in ("cd", "git", "python", "docker", "ray"), "no test knows this program"
 
 
 def test_files_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

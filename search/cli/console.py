@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,14 @@ FOLDED = ("Loss", "variant", "notation")
 def say(text: object, style: str | None = None) -> None:
     """Print text as it is: its brackets are no markup, and only its own lines end."""
     console.print(str(text), style=style, markup=False, soft_wrap=True, highlight=False)
+
+
+class Messages(logging.Handler):
+    """Messages of loggers, on stderr: above the progress, which a handler that knows only the stream would write into."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message."""
+        errors.print(self.format(record), markup=False, highlight=False)
 
 
 def say_json(data: Any) -> None:

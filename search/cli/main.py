@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 from sb3_aarl.search.cli import matrices, results, search, train
-from sb3_aarl.search.cli.console import errors
+from sb3_aarl.search.cli.console import Messages, errors
 from typer.core import TyperGroup
 
 # Extras of modules; of the others that are not always installed it is `search`.
@@ -85,7 +85,7 @@ def program(
 
 def main() -> None:
     """Run the program. SIGTERM, with which clusters announce the end of a job, is an interruption like Ctrl-C."""
-    logging.basicConfig(format="%(message)s")
+    logging.basicConfig(format="%(message)s", handlers=[Messages()])
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     app()
 

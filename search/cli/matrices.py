@@ -18,14 +18,16 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-def train_matrix(matrix: "Matrix", workers: int, retries: int = 3, config: Path | str = "") -> None:
+def train_matrix(
+    matrix: "Matrix", execution: options.Execution, workers: int | None, retries: int = 3, config: Path | str = ""
+) -> None:
     """Train the runs of a matrix that are not finished, once it is known that they can be, and show the progress."""
-    from sb3_aarl.search.execution.executors import LocalExecutor
     from sb3_aarl.search.execution.matrix import check_matrix, run_matrix
 
     check_matrix(matrix, str(config))
-    with LocalExecutor(workers) as executor, live() as show:
-        for progress in run_matrix(matrix, executor, workers, retries):
+    at_once = execution.at_once(workers, len(matrix.runs))
+    with execution.start(at_once, matrix.folder) as executor, live() as show:
+        for progress in run_matrix(matrix, executor, at_once, retries):
             counts = f"{progress.finished}/{progress.total} runs, {progress.failed} failed"
             show(f"{matrix.name}: {counts}, {time_to_go(progress.seconds_to_go)}", counts)
 
@@ -69,8 +71,20 @@ def exit_if_failed(matrix: "Matrix") -> None:
 
 
 @app.command(rich_help_panel="A search")
-def baselines(config: SearchFile, workers: Workers = 1, threads: Threads = None, folder: Folder = None) -> None:
+def baselines(
+    config: SearchFile,
+    workers: Workers = None,
+    threads: Threads = None,
+    folder: Folder = None,
+    executor: options.ExecutorName = "local",
+    ray_address: options.RayAddress = None,
+    slurm: options.Slurm = None,
+    cpus_per_run: options.CpusPerRun = None,
+    gpus_per_run: options.GpusPerRun = None,
+) -> None:
     """Train the baselines of a search, which its candidates are compared with."""
+    execution = options.Execution(executor, ray_address, slurm, cpus_per_run, gpus_per_run)
+
     from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
     from sb3_aarl.search.studies import search
 
@@ -81,7 +95,7 @@ def baselines(config: SearchFile, workers: Workers = 1, threads: Threads = None,
     if (searched.folder / STUDY_FILE).exists():
         search.check_study(load_study(open_storage(searched.folder), settings.name), settings, free=("threads",))
     matrix = search.baselines(settings, searched.folder)
-    train_matrix(matrix, workers, settings.retries, config)
+    train_matrix(matrix, execution, workers, settings.retries, config)
     compare(matrix, "Baselines, AULC")
     exit_if_failed(matrix)
 
@@ -93,11 +107,18 @@ def cross_validate(
         bool, typer.Option("--baselines", help="Train the file's baselines too, with the same environments and seeds.")
     ] = False,
     storage: Storage = None,
-    workers: Workers = 1,
+    workers: Workers = None,
     threads: Threads = None,
     folder: Folder = None,
+    executor: options.ExecutorName = "local",
+    ray_address: options.RayAddress = None,
+    slurm: options.Slurm = None,
+    cpus_per_run: options.CpusPerRun = None,
+    gpus_per_run: options.GpusPerRun = None,
 ) -> None:
     """Train the best candidates of a search on several environments, and write the winner as YAML."""
+    execution = options.Execution(executor, ray_address, slurm, cpus_per_run, gpus_per_run)
+
     from sb3_aarl.search.execution.storage import load_study, open_storage
     from sb3_aarl.search.studies import cross_validation
     from sb3_aarl.search.studies.search import Search
@@ -107,7 +128,7 @@ def cross_validate(
     searched = load_study(open_storage(path, storage, create=False), settings.name)
     matrix = cross_validation.make_matrix(settings, searched, path, settings.baselines if with_baselines else ())
     for part in cross_validation.rounds(settings, matrix):
-        train_matrix(part, workers, settings.retries, config)
+        train_matrix(part, execution, workers, settings.retries, config)
     table = compare(matrix, "Cross-validation, AULC: posterior mean, 95 % interval, probability to be the best")
     names = [baseline.name for baseline in settings.baselines]
     if not (candidates := table.drop(index=names, errors="ignore")).empty:
@@ -145,7 +166,7 @@ def benchmark(
         str | None, typer.Option(help="Evaluate, and save a checkpoint, after so many environment steps too, such as 20k.")
     ] = None,
     episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.", min=1)] = 10,
-    workers: Workers = 1,
+    workers: Workers = None,
     threads: Annotated[int, typer.Option(help="Threads of each run.", min=1)] = 1,
     folder: Annotated[
         Path | None,
@@ -155,9 +176,16 @@ def benchmark(
         ),
     ] = None,
     imports: options.Imports = "",
+    executor: options.ExecutorName = "local",
+    ray_address: options.RayAddress = None,
+    slurm: options.Slurm = None,
+    cpus_per_run: options.CpusPerRun = None,
+    gpus_per_run: options.GpusPerRun = None,
     dry_run: options.DryRun = False,
 ) -> None:
     """Train variants on tasks with seeds, as for the paper's tables, and show them. The same command resumes it."""
+    execution = options.Execution(executor, ray_address, slurm, cpus_per_run, gpus_per_run)
+
     from sb3_aarl.search.cli.results import table
     from sb3_aarl.search.studies.benchmark import RUNS, VARIANTS, load_benchmark, parse_seeds, parse_steps
 
@@ -172,8 +200,8 @@ def benchmark(
         configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder, modules(imports), wanted
     )
     if dry_run:
-        show_costs(unfinished(matrix), workers)
+        show_costs(unfinished(matrix), execution.at_once(workers, len(matrix.runs)))
         return
-    train_matrix(matrix, workers)
+    train_matrix(matrix, execution, workers)
     table(folder)
     exit_if_failed(matrix)

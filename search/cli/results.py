@@ -47,7 +47,8 @@ def status(
         progress, runs = search_status(study, open_storage(path, storage, create=False), path)
         is_over = all(row.filled == row.slots for row in progress.generations)
         hint = "" if runs or is_over else "\nNo driver runs here: the same aarl search resumes it."
-        say(f"Search {path}\n{progress_line(progress).replace('; ', chr(10))}, {progress.best_loss}{hint}")
+        loss = "" if progress.best_loss is None else f", {progress.best_loss}"
+        say(f"Search {path}\n{progress_line(progress).replace('; ', chr(10))}{loss}{hint}")
         found = True
     for part in ("", *PARTS):
         variants = matrix_status(path / part)

@@ -76,7 +76,7 @@ class Queue:
         failure = result["failure"]
         if failure is not None and result["retry"] and job.retries > 0 and not job.is_stopped:
             job.retries -= 1
-            logger.warning("%s is resubmitted: %s", job.folder, failure)
+            logger.warning("%s is resubmitted: %s", job.folder, failure.partition(". ")[0])
             return
         job.curve = [Evaluation(*row) for row in result["curve"]]
         job.failure = None if job.is_stopped and result["retry"] else failure
