@@ -73,8 +73,7 @@ class SACAux(SAC):
         was detected does not hold, a warning is raised and whole observations are stored
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
     :param n_steps: Steps of n-step returns; None (default) for 3, and for 1 with a buffer that is no WindowReplayBuffer
-    :param ent_coef: As in SB3; None (default) learns it, from 0.01 on, or from a hundredth of the mean magnitude of the first
-        batch's rewards if that is more
+    :param ent_coef: As in SB3; ``"auto_0.01"`` (default) learns it from 0.01 on
     :param target_entropy: As in SB3; ``"auto_0.5"`` (default) is half of what ``"auto"`` is
     :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
     :param policy_kwargs: Arguments of ``policies.SACAuxPolicy``
@@ -124,7 +123,7 @@ class SACAux(SAC):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int | None = None,
-        ent_coef: str | float | None = None,
+        ent_coef: str | float = "auto_0.01",
         target_update_interval: int = 1,
         target_entropy: str | float = "auto_0.5",
         use_sde: bool = False,
@@ -160,7 +159,7 @@ class SACAux(SAC):
             replay_buffer_kwargs,
             optimize_memory_usage,
             n_steps,  # type: ignore[arg-type]
-            "auto_0.01" if ent_coef is None else ent_coef,
+            ent_coef,
             target_update_interval,
             target_entropy,
             use_sde,
@@ -174,7 +173,6 @@ class SACAux(SAC):
             device,
             _init_setup_model=False,
         )
-        self._ent_coef_follows_rewards = ent_coef is None
         self.aux_loss = aux_loss
         self.aux_kwargs = aux_kwargs
         self.policy_delay = policy_delay
@@ -185,6 +183,7 @@ class SACAux(SAC):
         self.aux_head: AuxHead | None = None
         self.aux_optimizer: th.optim.Optimizer | None = None
         self._n_aux_skipped = 0
+        self._reward_scale = 1.0  # by which rewards are divided
         self._q_value_check = QValueCheck()
         self._stored_timesteps = 0  # steps whose transitions are in the buffer
         self._frame_stack: int | dict[str, int] = 1  # as detected; saved, since load() may have no wrappers to look at
@@ -313,10 +312,11 @@ class SACAux(SAC):
                 self._n_updates += 1
                 update_actor = self._n_updates % self.policy_delay == 0
                 batch, windows = self._sample(batch_size)
+                if self._n_updates == 1 and self.critic.norm == "batch":
+                    # The mean of a batch norm's outputs moves slowly: rewards of 10 and more would take thousands of steps.
+                    self._reward_scale = max(1.0, batch.rewards.abs().mean().item() / self.n_steps)
+                batch = batch._replace(rewards=batch.rewards / self._reward_scale)
                 log("largest_reward", batch.rewards.abs().max())
-                if self._n_updates == 1 and self._ent_coef_follows_rewards and self.log_ent_coef is not None:
-                    # Else Pendulum's rewards, up to 16, let actions saturate before the coefficient has grown.
-                    self.log_ent_coef.data += (batch.rewards.abs().mean() / self.n_steps).clamp(min=1).log()
                 if self.use_sde:
                     self.actor.reset_noise()
 
@@ -534,7 +534,8 @@ class SACAux(SAC):
         Neither the replay buffer, nor the environment, nor random generators are part of it.
         """
         tensors = {name: getattr(self, name).detach() for name in self._get_torch_save_params()[1]}
-        counters = {name: getattr(self, name) for name in ("num_timesteps", "_n_updates", "_n_aux_skipped", "_episode_num")}
+        names = ("num_timesteps", "_n_updates", "_n_aux_skipped", "_episode_num", "_reward_scale")
+        counters = {name: getattr(self, name) for name in names}
         state = {"parameters": self.get_parameters(), "tensors": tensors, "counters": counters}
         return copy.deepcopy({**state, "q_value_check": vars(self._q_value_check)})
 
