@@ -2,8 +2,8 @@
 From SAC to SACAux: the same lines with another class, on Gymnasium's Pendulum-v1, with SB3's EvalCallback.
 
 One sees the mean return of ten episodes after every 1,000 steps of SB3's SAC, then of SACAux, and the seconds that each
-took: both get to between -150 and -100, in four minutes of one core together. Pendulum is easy; what an auxiliary loss is
-worth shows on harder tasks, see results/.
+took: both get to about -150, in four minutes of one core together. Pendulum is easy; what an auxiliary loss is worth shows on
+harder tasks, see results/.
 
     python examples/sac_to_sac_aux.py
 """

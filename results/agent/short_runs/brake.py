@@ -1,0 +1,59 @@
+"""
+brake.py VARIANT SEED: 3,000 steps of Brake-v0, the environment of docs/guides/own.md, in ./my_package.py.
+
+Prints the mean return of ten episodes each 500 steps, and Q values, the size of actions and the entropy coefficient.
+"""
+
+import sys
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import torch as th
+
+sys.path.insert(0, ".")
+import my_package  # type: ignore[import-not-found]  # noqa: F401
+from stable_baselines3 import SAC
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_aarl import SACAux
+
+STEPS, EVERY = 3000, 500
+VARIANTS: dict[str, dict[str, Any]] = {
+    "ours": {},
+    "nonorm": {"policy_kwargs": {"critic_norm": None}},
+    "n1": {"n_steps": 1},
+    "momentum": {},  # of batch norm: 0.1
+    "delay1": {"policy_delay": 1},
+    "ent": {"ent_coef": "auto", "target_entropy": "auto"},
+}
+
+
+def main(name: str, seed: int) -> None:
+    warnings.simplefilter("ignore")
+    th.set_num_threads(1)
+    if name == "sac":
+        model: SAC = SAC("MlpPolicy", "Brake-v0", seed=seed, device="cpu")
+    else:
+        model = SACAux("MlpPolicy", "Brake-v0", seed=seed, device="cpu", learning_starts=300, **VARIANTS[name])
+    for module in model.critic.modules() if name == "momentum" else ():
+        if isinstance(module, th.nn.BatchNorm1d):
+            module.momentum = 0.1
+    shown = []
+    for _ in range(STEPS // EVERY):
+        model.learn(EVERY, reset_num_timesteps=model.num_timesteps == 0)
+        env = gym.make("Brake-v0")
+        env.reset(seed=1000 + seed)
+        text = f"{evaluate_policy(model, env, 10, warn=False)[0]:.0f}"
+        if isinstance(model, SACAux) and model.replay_buffer is not None and model.log_ent_coef is not None:
+            model.policy.set_training_mode(False)
+            with th.no_grad():
+                observations = model.replay_buffer.sample(256).observations
+                actions = model.actor(observations, deterministic=True)
+                q_values = th.cat(model.critic.q_values(model.critic.encode(observations), actions), 1).mean()
+            text += f" (Q {q_values:.0f} |a| {actions.abs().mean():.2f} ent {model.log_ent_coef.exp().item():.3f})"
+        shown.append(text)
+    print(name, seed, shown, flush=True)
+
+
+main(sys.argv[1], int(sys.argv[2]))
