@@ -88,7 +88,7 @@ wheel:
 	cd $$folder; echo 'raise SystemExit("not the package")' > search.py; \
 	python -c 'from sb3_aarl import SACAux; SACAux("MlpPolicy", "Pendulum-v1", aux_loss="aarl-state").learn(150)'; \
 	aarl losses; \
-	aarl train Pendulum-v1 --steps 1200 --evaluations 1 --episodes 1
+	aarl train Pendulum-v1 --steps 400 --evaluations 1 --episodes 1
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
