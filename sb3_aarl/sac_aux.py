@@ -382,15 +382,17 @@ class SACAux(SAC):
             next_trunk = self.critic.trunk(batch.next_observations) if shared else batch.next_observations
             next_actions, next_log_prob = self._act(next_trunk)
         if self.critic.norm == "batch":
-            # CrossQ: both states in one batch, so that batch norm sees what it is used on; no target Q networks.
+            # Both states in one batch, so that batch norm sees what it is used on (CrossQ), in the target Q networks too.
             with th.no_grad():
                 next_latent = self.critic.encode(next_trunk)
+            latents, actions = th.cat([latent, next_latent]), th.cat([batch.actions, next_actions])
             with self.critic.batch_statistics():
-                both = self.critic.q_values(th.cat([latent, next_latent]), th.cat([batch.actions, next_actions]))
-            q_values, next_q_values = zip(*(q.chunk(2) for q in both), strict=True)
+                q_values = [q.chunk(2)[0] for q in self.critic.q_values(latents, actions)]
+            with th.no_grad(), self.critic_target.batch_statistics():
+                next_q_values = [q.chunk(2)[1] for q in self.critic_target.q_values(latents, actions)]
         else:
-            q_values = self.critic.q_values(latent, batch.actions)
-            next_q_values = self.critic_target.q_values(self.critic_target.encode(batch.next_observations), next_actions)
+            q_values = list(self.critic.q_values(latent, batch.actions))
+            next_q_values = list(self.critic_target.q_values(self.critic_target.encode(batch.next_observations), next_actions))
         with th.no_grad():
             next_q, _ = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True)
             # n-step returns discount by gamma ** n_steps, by less where an episode ended.
@@ -443,8 +445,7 @@ class SACAux(SAC):
     def _update_target(self) -> None:
         # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.
         if self.tau > 0:
-            if self.critic.norm != "batch":  # which uses no target Q networks
-                polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
+            polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
             polyak_update(self.critic.encoder_parameters, self.critic_target.encoder_parameters, self._aux.tau)
 
     @contextmanager
