@@ -34,7 +34,7 @@ SOURCE = "results/make_tables.py"
 GUIDES = ("expect.md", "from_sac.md", "losses.md", "paper.md", "results.md")
 PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in GUIDES)]
 # The columns of the main table, and their variants in agent/proof/runs.
-PROVED = {"SACAux": "sac_aux", "no loss": "no_loss", "SAC": "sac", "CrossQ": "crossq", "TQC": "tqc"}
+PROVED = {"SACAux": "sac_aux", "`tau=1`": "tau_1", "no loss": "no_loss", "SAC": "sac", "CrossQ": "crossq", "TQC": "tqc"}
 # What a search does to losses; the others are drawn at random, from priors, or given.
 EVOLVED = ("crossover", "replacement", "horizon_change")
 DRAWN, BEST = 20, 10
@@ -88,7 +88,7 @@ def proof_row(name: str, values: list[str]) -> list[str]:
         return [name, *values]
     task, sac, crossq, best = values
     folders = [f"agent/proof/runs/{variant}/{task}" for variant in PROVED.values()]
-    published = ["-", "-", sac, crossq, "-"]
+    published = ["-", "-", "-", sac, crossq, "-"]
     cells = [folder if (RESULTS / folder).exists() else text for folder, text in zip(folders, published, strict=True)]
     return [name, *cells, best]
 

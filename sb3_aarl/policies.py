@@ -279,8 +279,8 @@ class SACAuxPolicy(SACPolicy):
         (-10, 2) (the public reference): tanh squashes it into them; gSDE ignores them
     :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases
         (CURL, the reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
-    :param critic_norm: ``"batch"`` (default): batch norm in the Q networks, one pass of both states and no target Q networks
-        (CrossQ, Bhatt et al., 2024), rewards divided by their mean magnitude in the first batch if that is above 1;
+    :param critic_norm: ``"batch"`` (default): batch norm in the Q networks, and both states of a transition in one batch
+        (CrossQ, Bhatt et al., 2024); rewards divided by their mean magnitude in the first batch if that is above 1;
         ``"layer"``: layer norm in them; None (SB3)
     :param kwargs: activation_fn, use_sde, log_std_init, use_expln, clip_mean, normalize_images, optimizer_class,
         optimizer_kwargs and n_critics of SB3's SACPolicy; Adam's ``betas`` are (0.5, 0.999) unless given (CrossQ)

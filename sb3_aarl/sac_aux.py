@@ -65,8 +65,8 @@ class SACAux(SAC):
     :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth of
         the first ``learn`` if that is less
     :param batch_size: Transitions for each critic and actor update
-    :param tau: Polyak coefficient of the target Q networks, of which ``critic_norm="batch"`` (default) uses none; 0 freezes
-        the whole target critic, as in SB3
+    :param tau: Polyak coefficient of the target Q networks; with 1 there are none, as in CrossQ; 0 freezes the whole target
+        critic, as in SB3
     :param gamma: Discount factor
     :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
     :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. If one that
@@ -114,7 +114,7 @@ class SACAux(SAC):
         buffer_size: int = 1_000_000,
         learning_starts: int | None = None,
         batch_size: int = 256,
-        tau: float = 0.005,
+        tau: float = 0.02,
         gamma: float = 0.99,
         train_freq: int | tuple[int, str] = 1,
         gradient_steps: int = 1,

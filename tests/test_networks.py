@@ -45,13 +45,13 @@ def test_a_policy_with_norms_is_trained_and_saved(norm: str, settings: dict[str,
     assert_same(everything(SACAux.load(tmp_path / "model")), everything(model))
 
 
-def test_batch_norm_sees_both_states_and_needs_no_target_networks() -> None:
+def test_batch_norm_sees_both_states_in_both_critics() -> None:
     model = filled_model(policy_kwargs={"critic_norm": "batch"})
     for _ in range(3):
         model.train(1, batch_size=16)
     batch, ent_coef = model.replay_buffer.sample(16)._replace(discounts=0.9), th.tensor(0.1)
     for parameter in (p for network in model.critic_target.q_networks for p in network.parameters()):
-        parameter.data.fill_(th.nan)
+        nn.init.normal_(parameter)
     running = model.critic.qf0[0].running_mean.clone()
     th.manual_seed(1)
     loss = model._critic_loss(model.critic.trunk(batch.observations), batch, ent_coef)
@@ -62,7 +62,7 @@ def test_batch_norm_sees_both_states_and_needs_no_target_networks() -> None:
     latent = th.cat([model.critic.encode(batch.observations), model.critic.encode(batch.next_observations)])
     x = th.cat([latent, th.cat([batch.actions, next_actions])], dim=1)
     values = []
-    for network in model.critic.q_networks:
+    for network in (*model.critic.q_networks, *model.critic_target.q_networks):
         h = x
         for layer in network:
             if isinstance(layer, nn.BatchNorm1d):
@@ -70,6 +70,6 @@ def test_batch_norm_sees_both_states_and_needs_no_target_networks() -> None:
             else:
                 h = layer(h)
         values.append(h[:, 0])
-    now, later = th.stack(values)[:, :16], th.stack(values)[:, 16:]
+    now, later = th.stack(values)[:2, :16], th.stack(values)[2:, 16:]
     wanted = batch.rewards[:, 0] + 0.9 * (1 - batch.dones[:, 0]) * (later.amin(0) - ent_coef * next_log_prob)
     th.testing.assert_close(loss, 0.5 * (now - wanted).pow(2).mean(1).sum())

@@ -78,6 +78,7 @@ SB3_SAC: dict[str, Any] = {
     "n_steps": 1,
     "ent_coef": "auto",
     "target_entropy": "auto",
+    "tau": 0.005,
     "policy_delay": 1,
     "policy_kwargs": {
         "features_extractor_class": "identity",

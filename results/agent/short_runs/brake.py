@@ -19,13 +19,14 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_aarl import SACAux
 
 STEPS, EVERY = 3000, 500
-VARIANTS: dict[str, dict[str, Any]] = {
-    "ours": {},
-    "nonorm": {"policy_kwargs": {"critic_norm": None}},
-    "n1": {"n_steps": 1},
-    "momentum": {},  # of batch norm: 0.1
-    "delay1": {"policy_delay": 1},
-    "ent": {"ent_coef": "auto", "target_entropy": "auto"},
+VARIANTS: dict[str, dict[str, Any]] = {  # of the defaults before ../targets: no target Q networks
+    "ours": {"tau": 1},
+    "nonorm": {"tau": 0.005, "policy_kwargs": {"critic_norm": None}},
+    "n1": {"tau": 1, "n_steps": 1},
+    "momentum": {"tau": 1},  # of batch norm: 0.1
+    "delay1": {"tau": 1, "policy_delay": 1},
+    "ent": {"tau": 1, "ent_coef": "auto", "target_entropy": "auto"},
+    **{f"tau_{tau}": {"tau": tau} for tau in (0.005, 0.02, 0.05, 0.1, 0.2)},
 }
 
 
