@@ -54,9 +54,9 @@ class SACAux(SAC):
     The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The encoder
     of the target critic is the momentum encoder of the auxiliary loss. Arguments that are not here are SB3's.
 
-    Defaults that are not SAC's are CrossQ's (learning rate, updates of the actor, batch norm in the Q networks), SimBa's
-    (entropy) and MR.Q's (three-step returns). With all of SAC's and ``aux_loss=None`` it is SB3's SAC, to the bit:
-    ``zoo_configs/sac.yml`` has them.
+    Defaults that are not SAC's are CrossQ's (learning rate, updates of the actor, batch norm in the Q networks, here with
+    target networks), SimBa's (entropy) and MR.Q's (three-step returns). With all of SAC's and ``aux_loss=None`` it is SB3's
+    SAC, to the bit: ``zoo_configs/sac.yml`` has them.
 
     :param policy: ``"MlpPolicy"`` (``simba`` encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
@@ -65,8 +65,7 @@ class SACAux(SAC):
     :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth of
         the first ``learn`` if that is less
     :param batch_size: Transitions for each critic and actor update
-    :param tau: Polyak coefficient of the target Q networks; with 1 there are none, as in CrossQ; 0 freezes the whole target
-        critic, as in SB3
+    :param tau: Polyak coefficient of the target Q networks; 1 for none, as in CrossQ; 0 freezes the target critic, as in SB3
     :param gamma: Discount factor
     :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
     :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. If one that
@@ -443,7 +442,7 @@ class SACAux(SAC):
         (self._aux.coef * aux_loss).backward()
 
     def _update_target(self) -> None:
-        # Without a copy of the Q networks a moving encoder would only detach them from it: tau=0 freezes both, as in SB3.
+        # tau=0 freezes all of the target critic, as in SB3: a moving encoder would only detach its Q networks from it.
         if self.tau > 0:
             polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
             polyak_update(self.critic.encoder_parameters, self.critic_target.encoder_parameters, self._aux.tau)
