@@ -385,10 +385,9 @@ class SACAux(SAC):
             with th.no_grad():
                 next_latent = self.critic.encode(next_trunk)
             latents, actions = th.cat([latent, next_latent]), th.cat([batch.actions, next_actions])
-            with self.critic.batch_statistics():
+            with self.critic.batch_statistics(), self.critic_target.batch_statistics():
                 q_values = [q.chunk(2)[0] for q in self.critic.q_values(latents, actions)]
-            with th.no_grad(), self.critic_target.batch_statistics():
-                next_q_values = [q.chunk(2)[1] for q in self.critic_target.q_values(latents, actions)]
+                next_q_values = [q.chunk(2)[1] for q in self.critic_target.q_values(latents.detach(), actions)]
         else:
             q_values = list(self.critic.q_values(latent, batch.actions))
             next_q_values = list(self.critic_target.q_values(self.critic_target.encode(batch.next_observations), next_actions))
