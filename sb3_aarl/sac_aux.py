@@ -65,7 +65,7 @@ class SACAux(SAC):
     :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth of
         the first ``learn`` if that is less
     :param batch_size: Transitions for each critic and actor update
-    :param tau: Polyak coefficient of the target Q networks; 1 for none, as in CrossQ; 0 freezes the target critic, as in SB3
+    :param tau: Polyak coefficient of the target Q networks; 1 for none, as in CrossQ; 0 freezes the target critic's weights
     :param gamma: Discount factor
     :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
     :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. If one that
@@ -328,7 +328,7 @@ class SACAux(SAC):
 
                 # Entropy coefficient: before the critic as in SB3, and the whole step uses its value from before the update.
                 if self.ent_coef_optimizer is None:
-                    ent_coef = self.ent_coef_tensor
+                    ent_coef = self.ent_coef_tensor / self._reward_scale
                 else:
                     assert self.log_ent_coef is not None and isinstance(self.target_entropy, float)
                     ent_coef = self.log_ent_coef.detach().exp()

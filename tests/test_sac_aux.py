@@ -536,12 +536,14 @@ def test_defaults_that_depend_on_run_and_actions() -> None:
     assert model.target_entropy == -1.0  # half of SAC's, which is -2 for two actions
 
 
-def test_rewards_of_any_magnitude_are_learnt_alike(tmp_path: pathlib.Path) -> None:
+@pytest.mark.parametrize("fixed", [None, 2.0**-4])
+def test_rewards_of_any_magnitude_are_learnt_alike(tmp_path: pathlib.Path, fixed: float | None) -> None:
     models = []
     for factor in (2.0**5, 2.0**15):  # powers of two, which change no other bit
         env = TransformReward(Point(), lambda reward, factor=factor: factor * reward)
         settings = {"policy_kwargs": {"critic_norm": "batch"}, "aux_loss": "forward-dynamics"}
-        models.append(make_model(env=env, n_steps=3, **settings).learn(60))
+        coefficient = {} if fixed is None else {"ent_coef": factor * fixed}
+        models.append(make_model(env=env, n_steps=3, **settings, **coefficient).learn(60))
     assert_same(models[0].policy.state_dict(), models[1].policy.state_dict())
     models[1].save(tmp_path / "model")
     loaded = SACAux.load(tmp_path / "model")
