@@ -19,7 +19,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from sb3_aarl.buffers import WindowReplayBuffer
 
-SPACES: Any = spaces.Box(-1, 1, (17,), np.float32), spaces.Box(-1, 1, (6,), np.float32)
+STATES, ACTIONS = spaces.Box(-1, 1, (17,), np.float32), spaces.Box(-1, 1, (6,), np.float32)
 BATCH, DRAWS = 256, 50
 
 
@@ -43,12 +43,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
-    n_step = {"n_steps": 3, "gamma": 0.99}
-    buffers = {
-        "SB3": ReplayBuffer(args.buffer_size, *SPACES, "cpu"),
-        "SB3, three steps": NStepReplayBuffer(args.buffer_size, *SPACES, "cpu", **n_step),
-        "ours": WindowReplayBuffer(args.buffer_size, *SPACES, "cpu"),
-        "ours, three steps": WindowReplayBuffer(args.buffer_size, *SPACES, "cpu", **n_step),
+    n_step: dict[str, Any] = {"n_steps": 3, "gamma": 0.99}
+    buffers: dict[str, ReplayBuffer] = {
+        "SB3": ReplayBuffer(args.buffer_size, STATES, ACTIONS, "cpu"),
+        "SB3, three steps": NStepReplayBuffer(args.buffer_size, STATES, ACTIONS, "cpu", **n_step),
+        "ours": WindowReplayBuffer(args.buffer_size, STATES, ACTIONS, "cpu"),
+        "ours, three steps": WindowReplayBuffer(args.buffer_size, STATES, ACTIONS, "cpu", **n_step),
     }
     milliseconds: dict[str, list[float]] = {name: [] for name in buffers}
     for buffer in buffers.values():
@@ -63,7 +63,7 @@ def main() -> None:
     table = Table("buffer", "ms")
     rows = [{"buffer": name, "ms": statistics.median(values)} for name, values in milliseconds.items()]
     for row in rows:
-        table.add_row(row["buffer"], f"{row['ms']:.2f}")
+        table.add_row(str(row["buffer"]), f"{row['ms']:.2f}")
     Console().print(table)
     if args.out:
         save_result(args.out, buffer_size=args.buffer_size, transitions=args.transitions, rows=rows)
