@@ -87,9 +87,9 @@ def proof_row(name: str, values: list[str]) -> list[str]:
     if len(values) > len(PROVED):
         return [name, *values]
     task, sac, crossq, best = values
-    folders = [f"agent/proof/runs/{variant}/{task}" for variant in PROVED.values()]
-    published = ["-", "-", "-", sac, crossq, "-"]
-    cells = [folder if (RESULTS / folder).exists() else text for folder, text in zip(folders, published, strict=True)]
+    published = {"sac": sac, "crossq": crossq}
+    folders = {variant: f"agent/proof/runs/{variant}/{task}" for variant in PROVED.values()}
+    cells = [folder if (RESULTS / folder).exists() else published.get(variant, "-") for variant, folder in folders.items()]
     return [name, *cells, best]
 
 

@@ -441,7 +441,7 @@ class SACAux(SAC):
         (self._aux.coef * aux_loss).backward()
 
     def _update_target(self) -> None:
-        # tau=0 freezes all of the target critic, as in SB3: a moving encoder would only detach its Q networks from it.
+        # tau=0 freezes all weights of the target critic, as in SB3: a moving encoder would detach its Q networks from it.
         if self.tau > 0:
             polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
             polyak_update(self.critic.encoder_parameters, self.critic_target.encoder_parameters, self._aux.tau)
