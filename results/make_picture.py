@@ -1,4 +1,4 @@
-"""Draw docs/images/curves.png: the class's defaults (agent/proof) on all tasks that they were run on, beside published agents."""
+"""Draw docs/images/curves.png: the class's defaults on the tasks of agent/proof, beside published agents."""
 
 from pathlib import Path
 
@@ -7,20 +7,20 @@ from paper_figures import learning_curves_plot, read_curves
 
 RESULTS = Path(__file__).parent
 VARIANTS = {"sac_aux": "SACAux", "no_loss": "SACAux without a loss", "sac": "SB3's SAC"}
-# Means of 10 seeds at 50,000 and 100,000 environment steps, read on 2026-11-27. DR.Q: github.com/dmksjfl/DR.Q, results/drq.csv. SAC:
-# on DeepMind Control SimBa's (github.com/SonyResearch/simba, results/sac.csv), on Gymnasium's tasks CrossQ's
-# (github.com/DAVIAN-Robotics/SimbaV2, results/baseline/sac.csv).
+# Means, read on 2026-11-27: of DR.Q at 50,000 and 100,000 environment steps (10 seeds; github.com/dmksjfl/DR.Q,
+# results/drq.csv), and of SAC in CrossQ's code at 100,000 (2 to 10 seeds; github.com/DAVIAN-Robotics/SimbaV2,
+# results/baseline/sac.csv). Both make one update a step.
 PUBLISHED = {
-    "cheetah-run": {"DR.Q": (464, 638), "SAC": (179, 329)},
-    "walker-walk": {"DR.Q": (771, 936), "SAC": (341, 783)},
-    "reacher-hard": {"DR.Q": (287, 923), "SAC": (252, 605)},
-    "finger-spin": {"DR.Q": (487, 819), "SAC": (399, 614)},
-    "quadruped-run": {"DR.Q": (440, 845), "SAC": (89, 103)},
-    "hopper-stand": {"DR.Q": (27, 347), "SAC": (4, 56)},
-    "HalfCheetah-v4": {"DR.Q": (8114, 9439), "SAC": (4212, 6156)},
-    "Walker2d-v4": {"DR.Q": (1658, 4151), "SAC": (384, 690)},
-    "Hopper-v4": {"DR.Q": (1987, 2258), "SAC": (530, 1103)},
-    "Ant-v4": {"DR.Q": (2433, 3817), "SAC": (448, 747)},
+    "cheetah-run": ((464, 638), 178),
+    "walker-walk": ((771, 936), 449),
+    "reacher-hard": ((287, 923), 602),
+    "finger-spin": ((487, 819), 475),
+    "quadruped-run": ((440, 845), 74),
+    "hopper-stand": ((27, 347), 31),
+    "HalfCheetah-v4": ((8114, 9439), 6156),
+    "Walker2d-v4": ((1658, 4151), 690),
+    "Hopper-v4": ((1987, 2258), 1103),
+    "Ant-v4": ((2433, 3817), 747),
 }
 
 
@@ -32,9 +32,9 @@ def main() -> None:
     curves["env"] = pd.Categorical(curves["env"], list(PUBLISHED))
     figure = learning_curves_plot(curves.sort_values(["env", "variant"]), columns=2, width=2.7)
     for axes in figure.axes:
-        published = PUBLISHED[axes.get_title().partition("\n")[0]]
-        for agent, symbol in zip(("DR.Q", "SAC"), ("_", "x"), strict=True):
-            axes.scatter([50_000, 100_000], published[agent], marker=symbol, s=90, color="black", zorder=3)
+        dr_q, sac = PUBLISHED[axes.get_title().partition("\n")[0]]
+        axes.scatter([50_000, 100_000], dr_q, marker="_", s=120, color="black", zorder=3)
+        axes.scatter([100_000], [sac], marker="x", s=40, color="black", zorder=3)
         axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
     figure.savefig(RESULTS.parent / "docs" / "images" / "curves.png", dpi=140, bbox_inches="tight")
 
