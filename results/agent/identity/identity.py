@@ -24,19 +24,19 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
-def momentum(value: float) -> Callable[[th.nn.Sequential], None]:
-    def change(network: th.nn.Sequential) -> None:
-        for layer in network:
+def momentum(value: float) -> Callable[[th.nn.Module], None]:
+    def change(network: th.nn.Module) -> None:
+        for layer in network.modules():
             if isinstance(layer, th.nn.BatchNorm1d):
                 layer.momentum = value
 
     return change
 
 
-def without(*positions: int) -> Callable[[th.nn.Sequential], None]:
-    def change(network: th.nn.Sequential) -> None:
+def without(*positions: int) -> Callable[[th.nn.Module], None]:
+    def change(network: th.nn.Module) -> None:
         for position in positions:
-            network[position] = th.nn.Identity()
+            setattr(network, str(position), th.nn.Identity())
 
     return change
 
