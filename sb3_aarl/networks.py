@@ -53,7 +53,8 @@ def q_network(norm: str | None, inputs: int, net_arch: list[int], activation_fn:
     A Q network.
 
     :param norm: None as in SB3; ``"layer"``: layer norm before each activation; ``"batch"``: batch norm before each linear
-        layer, the last one too (CrossQ, Bhatt et al., 2024)
+        layer, the last one too (CrossQ, Bhatt et al., 2024), with PyTorch's momentum: the actor reads running statistics,
+        which must not lag behind the weights (results/agent/identity)
     :param inputs: Width of latent state and action together
     :param net_arch: Widths of the hidden layers
     :param activation_fn: Class of the activations
@@ -64,7 +65,7 @@ def q_network(norm: str | None, inputs: int, net_arch: list[int], activation_fn:
     if norm == "batch":
         for position, layer in reversed(list(enumerate(layers))):
             if isinstance(layer, nn.Linear):
-                normalization = nn.BatchNorm1d(layer.in_features, eps=1e-3, momentum=0.01)
+                normalization = nn.BatchNorm1d(layer.in_features, eps=1e-3)
                 normalization.num_batches_tracked = th.tensor(0.0)  # a float, as all that SB3's tools expect among parameters
                 layers.insert(position, normalization)
     return nn.Sequential(*layers)

@@ -13,7 +13,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, EveryNTimesteps, StopTrainingOnMaxEpisodes
-from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.envs import BitFlippingEnv, IdentityEnvBox
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
@@ -514,3 +515,11 @@ def test_her(caplog: pytest.LogCaptureFixture) -> None:
     moved = moved_by_training(model, 40)
     assert isinstance(model.replay_buffer, HerReplayBuffer) and model.replay_buffer.size() == 40
     assert moved.pop("head") == [] and all(map(all, moved.values()))
+
+
+def test_sb3s_identity_task_is_learnt() -> None:
+    """SB3 trains SAC on it; reward 1 where the action is within 0.5 of the observation, 100 steps an episode."""
+    env = DummyVecEnv([lambda: IdentityEnvBox(eps=0.5)])
+    model = SACAux("MlpPolicy", env, policy_kwargs={"net_arch": [64, 64]}, gamma=0.95, learning_starts=100, seed=1)
+    model.learn(1_050)
+    assert evaluate_policy(model, env, 20, warn=False)[0] > 90
