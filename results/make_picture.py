@@ -26,8 +26,7 @@ PUBLISHED = {
 
 def main() -> None:
     curves = read_curves(RESULTS / "agent" / "proof" / "runs")
-    ours = curves.loc[curves["variant"].isin(["sac_aux", "momentum_0.01"]), "env"]
-    curves = curves[curves["variant"].isin(VARIANTS) & curves["env"].isin(set(ours) & PUBLISHED.keys())]
+    curves = curves[curves["variant"].isin(VARIANTS) & curves["env"].isin(PUBLISHED)]
     curves["variant"] = pd.Categorical(curves["variant"].map(VARIANTS), list(VARIANTS.values()))
     curves["env"] = pd.Categorical(curves["env"], list(PUBLISHED))
     figure = learning_curves_plot(curves.sort_values(["env", "variant"]), columns=2, width=2.7)

@@ -100,7 +100,7 @@ def sentence(text: str) -> str:
         mean, *_, number = returns(RESULTS / found[2]).split()
         return f"{number.strip('()')} {'seed' if number == '(1)' else 'seeds'}" if found[1] else mean
 
-    return textwrap.fill(re.sub(r"\{(seeds )?([\w-]+/[\w./-]+)\}", figure, text), 126, break_on_hyphens=False)
+    return textwrap.fill(re.sub(r"\{(seeds )?([\w-]+/[\w/-]+)\}", figure, text), 126, break_on_hyphens=False)
 
 
 def returns(folder: Path) -> str:
