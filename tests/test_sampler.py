@@ -510,6 +510,19 @@ def test_an_interrupted_enqueued_trial_comes_again(given: dict[str, Any], sugges
     assert given.items() <= {**loss_to_params(losses[0][0]), "rate": losses[0][1] if "rate" in given else None}.items()
 
 
+def test_an_interrupted_trial_keeps_what_another_sampler_drew() -> None:
+    study = make_study(independent_sampler=optuna.samplers.RandomSampler())
+    params = []
+    for _ in range(3):
+        trial = study.ask()
+        suggest_aux_loss(trial)
+        trial.suggest_float("rate", 0, 1)
+        params.append(trial.params)
+        trial.set_user_attr("interrupted", True)
+        study.tell(trial, state=TrialState.FAIL)
+    assert params == params[:1] * 3
+
+
 def test_promising_losses_run_again_with_their_next_seeds() -> None:
     study = make_study(again=0.4, population_size=10, n_generations=6)
     seeds: dict[AuxLoss, list[int]] = {}

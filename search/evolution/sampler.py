@@ -321,8 +321,8 @@ class _Slots:
         if is_enqueued:  # an invalid one costs no attempt: the next one in the slot is drawn by its own number
             key |= {"enqueued": number + 1, "operation": "enqueued", "parents": [], "loss": None, SEED_INDEX_KEY: 0}
             return {SLOT_KEY: key}
-        if again := self.interrupted.get(free[0]):
-            return {name: value for name, value in again.system_attrs.items() if name in (SLOT_KEY, FIXED_KEY)}
+        if again := self.interrupted.get(free[0]):  # its runs are there already: with all its parameters
+            return {SLOT_KEY: again.system_attrs[SLOT_KEY], FIXED_KEY: again.system_attrs.get(FIXED_KEY, {}) | again.params}
         loss, operation, parents, seed_index = self.candidates.of_slot(generation, slot, attempt)
         key |= {"operation": operation, "parents": list(parents), "loss": str(loss), SEED_INDEX_KEY: seed_index}
         return {SLOT_KEY: key}
