@@ -1,5 +1,6 @@
 """Commands that train a matrix of runs and show its tables: baselines, cross-validation, benchmark."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,17 +20,25 @@ app = typer.Typer()
 
 
 def train_matrix(
-    matrix: "Matrix", execution: options.Execution, workers: int | None, retries: int = 3, config: Path | str = ""
+    matrix: "Matrix",
+    execution: options.Execution,
+    workers: int | None,
+    retries: int = 3,
+    config: Path | str = "",
+    parts: "Iterable[Matrix] | None" = None,
 ) -> None:
-    """Train the runs of a matrix that are not finished, once it is known that they can be, and show the progress."""
+    """
+    Train the runs of a matrix that are not finished, part by part, once it is known that they can be, and show the progress.
+    """
     from sb3_aarl.search.execution.matrix import check_matrix, run_matrix
 
     check_matrix(matrix, str(config))
     at_once = execution.at_once(workers, len(matrix.runs))
     with execution.start(at_once, matrix.folder) as executor, live() as show:
-        for progress in run_matrix(matrix, executor, at_once, retries):
-            counts = f"{progress.finished}/{progress.total} runs, {progress.failed} failed"
-            show(f"{matrix.name}: {counts}, {time_to_go(progress.seconds_to_go)}", counts)
+        for part in [matrix] if parts is None else parts:
+            for progress in run_matrix(part, executor, at_once, retries):
+                counts = f"{progress.finished}/{progress.total} runs, {progress.failed} failed"
+                show(f"{matrix.name}: {counts}, {time_to_go(progress.seconds_to_go)}", counts)
 
 
 def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":
@@ -127,8 +136,7 @@ def cross_validate(
     settings, path = found.config, found.folder
     searched = load_study(open_storage(path, storage, create=False), settings.name)
     matrix = cross_validation.make_matrix(settings, searched, path, settings.baselines if with_baselines else ())
-    for part in cross_validation.rounds(settings, matrix):
-        train_matrix(part, execution, workers, settings.retries, config)
+    train_matrix(matrix, execution, workers, settings.retries, config, cross_validation.rounds(settings, matrix))
     table = compare(matrix, "Cross-validation, AULC: posterior mean, 95 % interval, probability to be the best")
     names = [baseline.name for baseline in settings.baselines]
     if not (candidates := table.drop(index=names, errors="ignore")).empty:
