@@ -29,9 +29,7 @@ class Averages(BaseCallback):
     averages: dict[float, AveragedModel]
 
     def _on_training_start(self) -> None:
-        self.averages = {
-            decay: AveragedModel(self.model.actor, multi_avg_fn=get_ema_multi_avg_fn(decay)) for decay in DECAYS
-        }
+        self.averages = {decay: AveragedModel(self.model.actor, multi_avg_fn=get_ema_multi_avg_fn(decay)) for decay in DECAYS}
         self.n_updates = 0
 
     def _on_step(self) -> bool:
