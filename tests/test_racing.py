@@ -52,6 +52,30 @@ def test_the_probabilities_are_calibrated() -> None:
     assert np.mean(is_best) == pytest.approx(np.mean(p_first), abs=0.06)
 
 
+def test_the_posterior_is_that_of_the_priors() -> None:
+    """Flat in the mean, the logarithm of the noise and the deviation of the true values: integrated on a grid."""
+    scores = np.array([[10.0, 60.0], [-20.0, 10.0], [0.0, -60.0]])
+    of_loss = np.repeat(np.eye(3), 2, axis=0)  # of each run, in the order of the scores
+    noise, spread = (grid.ravel() for grid in np.meshgrid(np.logspace(0, 4, 100), np.logspace(-2, 5, 140)))
+    prior = spread[:, None, None] ** 2 * np.eye(3) + 1e12  # the mean may be anything
+    covariance = of_loss @ prior @ of_loss.T + noise[:, None, None] ** 2 * np.eye(6)
+    gain = np.linalg.solve(covariance, of_loss @ prior)
+    fits = -0.5 * (
+        np.linalg.slogdet(covariance)[1] + scores.ravel() @ np.linalg.solve(covariance, scores.ravel()[:, None])[..., 0].T
+    )
+    p = spread * np.exp(fits - fits.max())
+    at = np.random.default_rng(0).choice(len(p), 4000, p=p / p.sum())
+    means = scores.ravel() @ gain[at]
+    spreads = np.linalg.cholesky(prior[at] - np.swapaxes(of_loss @ prior[at], 1, 2) @ gain[at] + 1e-3 * np.eye(3))
+    draws = means + (spreads @ np.random.default_rng(1).standard_normal((4000, 3, 1)))[..., 0]
+    found = standings(scores)
+    np.testing.assert_allclose(found.mean, draws.mean(axis=0), atol=4)
+    np.testing.assert_allclose(found.p_best, np.bincount(draws.argmax(axis=1)) / 4000, atol=0.03)
+    np.testing.assert_allclose(
+        found.high - found.low, np.diff(np.quantile(draws, [0.025, 0.975], axis=0), axis=0)[0], rtol=0.1
+    )
+
+
 def test_with_many_seeds_the_posterior_is_that_of_the_means() -> None:
     truth, rng = np.array([100.0, 103.0, 110.0]), np.random.default_rng(1)
     scores = truth[:, None] + 5 * rng.normal(size=(3, 400))

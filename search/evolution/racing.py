@@ -84,7 +84,7 @@ def _draws(scores: np.ndarray) -> np.ndarray:
     centres = (means / variances).sum(axis=1) / weights
     squares = ((means - centres[:, None]) ** 2 / variances).sum(axis=1) + np.nansum((scores - means[:, None]) ** 2)
     squares = np.maximum(squares, 1e-24 * max(1.0, np.abs(means).max()) ** 2)  # of equal scores
-    freedom = counts.sum() - 1
+    freedom = max(1, counts.sum() - 2)  # the last prior takes one
     log_p = -0.5 * (np.log(variances).sum(axis=1) + np.log(weights) + freedom * np.log(squares) - np.log(RATIOS))
     p = np.exp(log_p - log_p.max())
     rng = np.random.default_rng(0)
