@@ -407,6 +407,34 @@ def test_an_ask_beyond_the_free_slots_gets_one_more_offspring() -> None:
     assert key_of(study.ask()) == (2, 5 + 17, 0)
 
 
+def test_a_trial_that_ends_after_its_generation_is_known_in_the_next_ones() -> None:
+    study = make_study(population_size=4, n_random=4, n_prior=0, random=0, replacement=0.7, parent_selection="posterior")
+    trials = [study.ask() for _ in range(5)]  # one more than there are slots
+    losses = [suggest_aux_loss(trial, 2) for trial in trials]
+    for trial in trials[1:]:
+        study.tell(trial, 0.0)
+    study.tell(trials[0], 100.0)  # its generation is over
+    for _ in range(4):
+        trial = study.ask()
+        assert trial.user_attrs["generation"] == 2 and trial.user_attrs["parents"] != [0]
+        suggest_aux_loss(trial, 2)
+        study.tell(trial, 0.0)
+    trial = study.ask()
+    assert trial.user_attrs["generation"] == 3 and trial.user_attrs["parents"] == [0]
+    assert suggest_aux_loss(trial, 2) not in losses
+
+
+def test_what_a_user_fixes_is_kept_beside_an_interrupted_trial() -> None:
+    study = make_study()
+    trial = study.ask()
+    drawn = suggest_aux_loss(trial), trial.suggest_float("rate", 0, 1)
+    trial.set_user_attr("interrupted", True)
+    study.tell(trial, state=TrialState.FAIL)
+    study.enqueue_trial({"rate": 0.25})
+    fixed, again = ((suggest_aux_loss(trial), trial.suggest_float("rate", 0, 1)) for trial in (study.ask(), study.ask()))
+    assert fixed[1] == 0.25 and fixed[0] != drawn[0] and again == drawn
+
+
 def test_a_trial_that_stays_running_holds_up_no_generation() -> None:
     study = make_study(population_size=np.int64(12), storage=RDBStorage("sqlite:///:memory:"))  # NumPy's numbers are numbers
     suggest_aux_loss(study.ask())

@@ -141,18 +141,22 @@ class Candidates:
             attempts.add(candidate.loss.canonical())
         return candidate
 
-    def end_generation(self, results: Sequence[Result]) -> None:
-        """Choose the parents of the next generation; results are in the order of slots, which is the order of equal ones."""
+    def end_generation(self, results: Sequence[Result], late: Sequence[Result] = ()) -> None:
+        """
+        Choose the parents of the next generation; results are in the order of slots, which is the order of equal ones.
+        ``late`` are those of generations before that came since the last one was over: known, and no parents by their score.
+        """
         while self.to_plan:
             self._plan_next()
-        for result in results:
+        for result in (*results, *late):
             self.seen.setdefault(result.loss.canonical(), len(self.seen))
-        scored = [result for result in results if not math.isnan(result.score)]
-        for result in scored:
+        scored, scored_late = ([result for result in some if not math.isnan(result.score)] for some in (results, late))
+        for result in scored + scored_late:
             self.known.setdefault(result.loss.canonical(), result)
         settings, ratings, of_whom = self.settings, [result.score for result in scored], scored
         if settings.screening > 1 or settings.climbing or settings.again or settings.parent_selection == "posterior":
-            self.model.add([result.loss for result in scored], ratings)
+            every = scored + scored_late
+            self.model.add([result.loss for result in every], [result.score for result in every])
         if settings.parent_selection == "posterior" and self.model.scores:
             of_whom = list(self.known.values())
             ratings = list(self.model.posterior([result.loss for result in of_whom])[0])

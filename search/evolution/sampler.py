@@ -6,7 +6,7 @@ import math
 import threading
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -141,14 +141,13 @@ class AuxLossSampler(Settings, BaseSampler):
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
         if self.independent_sampler is not None:
             self.independent_sampler.before_trial(study, trial)
-        fixed = {**trial.params, **trial.system_attrs.get(FIXED_KEY, {})}
-        self._assign(study, trial, is_enqueued=not self._space.keys().isdisjoint(fixed))
+        self._assign(study, trial, {**trial.params, **trial.system_attrs.get(FIXED_KEY, {})})
 
-    def _assign(self, study: Study, trial: FrozenTrial, is_enqueued: bool = False) -> dict[str, Any]:
+    def _assign(self, study: Study, trial: FrozenTrial, fixed: Collection[str] = ()) -> dict[str, Any]:
         """The slot of a trial, which gets one if it has none."""
         if SLOT_KEY not in trial.system_attrs:  # Optuna's copy of a trial whose heartbeat stopped has
             with LOCK:
-                assigned = self._refresh(study).assign(trial.number, is_enqueued)
+                assigned = self._refresh(study).assign(trial.number, fixed)
                 for key, value in assigned.items():
                     study._storage.set_trial_system_attr(trial._trial_id, key, value)
             trial.system_attrs.update(assigned)
@@ -243,6 +242,7 @@ class _Slots:
         self.last_started = 1
         self.running: set[tuple[int, int]] = set()  # generation and slot
         self.results: defaultdict[int, dict[int, Result | None]] = defaultdict(dict)  # None where a trial has no loss
+        self.late: list[Result] = []  # of generations that were over, since the last one was
         self.failed: Counter[tuple[int, int]] = Counter()
         self.interrupted: dict[tuple[int, int], FrozenTrial] = {}  # the last trial of a slot, if it was interrupted
 
@@ -280,11 +280,14 @@ class _Slots:
             result = None
             if loss is not None:
                 result = Result(trial.number, loss, score if is_feasible and math.isfinite(score) else math.nan)
-            if generation >= self.candidates.generation:  # else the choice of parents is settled
+            if generation >= self.candidates.generation:
                 self.results[generation].setdefault(slot, result)
+            elif result is not None:
+                self.late.append(result)
             while len(filled := self.results[self.candidates.generation]) >= self._size(self.candidates.generation):
                 of_generation = sorted(filled.items())
-                self.candidates.end_generation([result for _, result in of_generation if result is not None])
+                self.candidates.end_generation([result for _, result in of_generation if result is not None], self.late)
+                self.late = []
 
     def _size(self, generation: int) -> int:
         return len(self.sampler.operations(generation))
@@ -305,11 +308,12 @@ class _Slots:
         failed = sum(number for (of, _), number in self.failed.items() if of == generation)
         return GenerationProgress(generation, self._size(generation), len(self.results[generation]), running, failed)
 
-    def assign(self, number: int, is_enqueued: bool) -> dict[str, Any]:
-        """The system attributes of the trial of this number, which is asked for."""
-        free = self.free()
-        if is_enqueued:  # an interrupted slot keeps its loss; no offspring is lost, if that can be
+    def assign(self, number: int, fixed: Collection[str]) -> dict[str, Any]:
+        """The system attributes of the trial of this number, which is asked for and has these parameters already."""
+        free, is_enqueued = self.free(), not self.sampler._space.keys().isdisjoint(fixed)
+        if fixed:  # an interrupted slot keeps its parameters
             free = [at for at in free if at not in self.interrupted]
+        if is_enqueued:  # no offspring is lost, if that can be
             free.sort(key=lambda at: self.sampler.operations(at[0])[at[1]] != "random")
         if not free:
             generation = int(min(self.candidates.generation, self.last))
