@@ -62,8 +62,8 @@ class SACAux(SAC):
     :param env: The environment, or its registered name
     :param learning_rate: Of all optimizers that have none of their own, may be a schedule
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
-    :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth of
-        the first ``learn`` if that is less
+    :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth
+        of each ``learn`` if that is less
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 1 for none, as in CrossQ; 0 freezes the target critic's weights
     :param gamma: Discount factor
@@ -185,6 +185,7 @@ class SACAux(SAC):
         self._reward_scale = 1.0  # by which rewards are divided
         self._q_value_check = QValueCheck()
         self._stored_timesteps = 0  # steps whose transitions are in the buffer
+        self._default_learning_starts: int | None = None  # which the last learn() has set
         self._frame_stack: int | dict[str, int] = 1  # as detected; saved, since load() may have no wrappers to look at
 
         if _init_setup_model:
@@ -505,8 +506,9 @@ class SACAux(SAC):
         if not reset_num_timesteps and self._stored_timesteps != self.num_timesteps:
             # A callback ended learn() before the last transition was stored: SB3 resets the environments.
             self._last_obs = None
-        if self.learning_starts is None:
-            self.learning_starts = default_learning_starts(total_timesteps)
+        if self.learning_starts in (None, self._default_learning_starts):
+            before = 0 if reset_num_timesteps else self.num_timesteps
+            self.learning_starts = self._default_learning_starts = default_learning_starts(before + total_timesteps)
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if self._n_updates and self._n_aux_skipped == self._n_updates:
             warnings.warn(f"aux_loss was never trained: no episode is as long as its horizon ({self.aux_loss})", stacklevel=2)
@@ -570,7 +572,10 @@ class SACAux(SAC):
             given = load_from_zip_file(given, device=device, load_data=False)[1]
         own, auxiliary = self.get_parameters(), {"aux_head", "aux_optimizer"}
         if _shapes(own.get("aux_head", {})) != _shapes(given.get("aux_head", {})):
-            logger.warning("no parameters of this model's aux_loss (%s) are given: its own stay as they are", self.aux_loss)
+            if self.aux_head is not None:
+                logger.warning(
+                    "no parameters of this model's aux_loss (%s) are given: its own stay as they are", self.aux_loss
+                )
             given = {name: value for name, value in given.items() if name not in auxiliary}
             given |= {name: own[name] for name in auxiliary & own.keys()}
         key = "critic.optimizer"

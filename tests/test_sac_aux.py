@@ -532,6 +532,10 @@ def test_a_horizon_longer_than_any_episode_is_skipped_and_counted(joint: bool) -
 def test_defaults_that_depend_on_run_and_actions() -> None:
     model = SACAux("MlpPolicy", make_env("state"), batch_size=8, device="cpu").learn(60)
     assert (model.learning_starts, model._n_updates) == (6, 54)  # a tenth of a short run
+    assert model.learn(20)._n_updates == 54 + 18  # of each one
+    assert model.learn(20, reset_num_timesteps=False)._n_updates == 54 + 18 + 20
+    model.learning_starts = 30
+    assert model.learn(20)._n_updates == 54 + 18 + 20
     assert default_learning_starts(10**6) == 5000
     assert model.target_entropy == -1.0  # half of SAC's, which is -2 for two actions
 
