@@ -265,8 +265,12 @@ class WindowReplayBuffer(ReplayBuffer):
         self.timeouts[self.pos - 1, envs] = True
 
     def _by_key(self, obs: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        def rows(part: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+            missing = np.ndim(part) <= len(shape)  # axes that SB3 adds, as to a Discrete observation
+            return np.reshape(part, (self.n_envs, *shape)) if missing else np.broadcast_to(part, (self.n_envs, *shape))
+
         parts = obs if isinstance(obs, dict) else {"": obs}
-        return {key: np.asarray(parts[key]).reshape(self.n_envs, *store.shape) for key, store in self.stores.items()}
+        return {key: rows(parts[key], store.shape) for key, store in self.stores.items()}
 
     def _starts(self, current: dict[str, np.ndarray]) -> np.ndarray:
         """Which envs begin an episode with these observations."""
