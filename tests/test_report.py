@@ -233,11 +233,11 @@ def test_report_of_another_sampler(tmp_path):
     """Trials without a loss, a generation or an operation have a report too; the lowest is the best here."""
     study = optuna.create_study(direction="minimize")
     for value in (2.0, 1.0):
-        trial = study.ask({"x": FloatDistribution(0, 1)})
+        trial = study.ask({"x": FloatDistribution(0.5, 0.5)})
         study.tell(trial, value)
     write_report(study, tmp_path / "report.html")
     rows = table_after(read_page(tmp_path / "report.html"), "Best losses")
-    assert rows == [["no loss", "1", "1.00", "1", "-", "–"], ["no loss", "0", "2.00", "1", "-", "–"]]
+    assert rows == [["no loss", "x=0.5", "1", "1.00", "1", "-", "–"], ["no loss", "x=0.5", "0", "2.00", "1", "-", "–"]]
 
 
 @pytest.mark.slow

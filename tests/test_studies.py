@@ -189,6 +189,14 @@ def test_a_search_on_several_environments_and_of_hyperparameters(tmp_path: Path,
         # The AULC is 1 on both: a half, and 1.
         assert trial.user_attrs["scores"] == dict(zip(tasks, (0.5, 1.0), strict=True)) and trial.value == 0.75
     assert {trial.params["batch_size"] for trial in search.study.trials} <= {8, 16}
+    # The best is cross-validated with the values that it had.
+    matrix = cross_validation.make_matrix(search.config, search.study, tmp_path)
+    best, values = (
+        search.study.best_trial,
+        cross_validation.searched_values(search.config, search.study, loss_of(search.study.best_trial).canonical()),
+    )
+    assert values == {name: best.params[name] for name in ("batch_size", "learning_rate")}
+    assert len(matrix.runs) == 6 and all(run.hyperparameters.items() >= values.items() for run in matrix.runs.values())
 
     for changes, message in (
         ({"overrides": {"gamma": 0.8}}, "environments.Pendulum-v1.gamma=None, not 0.8"),

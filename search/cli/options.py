@@ -33,8 +33,8 @@ SearchFolder = Annotated[
 Storage = Annotated[
     str | None,
     Option(
-        help="URL of a database, such as postgresql://user@host/db; the study has the name of the search's folder, which need "
-        "not be there. Default: SQLite in the folder."
+        help="URL of a database, such as postgresql://user@host/db; the study has the name of the search's file; the folder "
+        "need not be there. Default: SQLite in the folder."
     ),
 ]
 Workers = Annotated[

@@ -86,6 +86,18 @@ def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
     return AuxLoss(int(horizon), source, target, operator, params.get("negatives", False))
 
 
+def other_params(params: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a trial beside those of its loss."""
+    own = ("horizon", "operator", "negatives") if "negatives" in params else ("horizon",)
+    return {name: value for name, value in params.items() if name not in own and not name.startswith(("source/", "target/"))}
+
+
+def with_values(values: Mapping[str, Any]) -> str:
+    """Such values as text after that of a loss, numbers rounded."""
+    texts = [f"{name}={value:.4g}" if isinstance(value, float) else f"{name}={value}" for name, value in values.items()]
+    return f", with {', '.join(texts)}" if values else ""
+
+
 def loss_of(trial: FrozenTrial) -> AuxLoss | None:
     """The loss of a trial; None if it was never asked for one, or has parameters that are no valid loss."""
     try:

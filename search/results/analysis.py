@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
-from sb3_aarl.search.evolution.space import loss_of
+from sb3_aarl.search.evolution.space import loss_of, other_params
 from scipy.stats import ttest_ind
 
 from sb3_aarl import catalog
@@ -34,18 +34,23 @@ HEADINGS = {
 COLUMNS: dict[str, Any] = {
     **{"number": int, "state": str, "generation": int, "operation": str, "parents": object, "score": float},
     **{"loss": object, "canonical": object, "horizon": "Int64", "operator": object, "negatives": "boolean", "curve": object},
+    "others": object,
 }
 
 
 def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     """
     The trials of a study as the table that the other functions take, one row each, finished or not: ``score`` is NaN where
-    there is none, ``loss`` and ``canonical`` an AuxLoss or None, ``curve`` a list of (environment steps, mean return).
+    there is none, ``loss`` and ``canonical`` an AuxLoss or None, ``curve`` a list of (environment steps, mean return),
+    ``others`` the parameters that were searched beside the loss.
     """
     rows = []
     for trial in trials:
         loss = loss_of(trial)
-        has_score = trial.state == TrialState.COMPLETE and trial.value is not None and math.isfinite(trial.value)
+        is_feasible = all(value <= 0 for value in trial.constraints.values())
+        has_score = (
+            trial.state == TrialState.COMPLETE and is_feasible and trial.value is not None and math.isfinite(trial.value)
+        )
         row = {
             "number": trial.number,
             "state": "interrupted" if trial.user_attrs.get("interrupted") else trial.state.name.lower(),
@@ -57,6 +62,7 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
             "loss": loss,
             "canonical": None if loss is None else loss.canonical(),
             "curve": trial.user_attrs.get("curve", []),
+            "others": other_params(trial.params),
         }
         rows.append(row | {key: getattr(loss, key, None) for key in ("horizon", "operator", "negatives")})
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
@@ -147,12 +153,17 @@ def effects(table: pd.DataFrame, by: str | Sequence[str]) -> pd.DataFrame:
     return result.join(pd.DataFrame(tests, index=result.index, columns=["difference", "welch_p"], dtype=float))
 
 
-def lineage(table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE) -> pd.DataFrame:
-    """The best trial and all its ancestors, the latest first; ``gain`` is the score less that of the best parent."""
-    numbers = set(ranked(table, direction)["number"][:1])
-    for number in range(max(numbers, default=-1), -1, -1):
-        if number in numbers:
-            numbers |= set(table["parents"][number])
+def lineage(
+    table: pd.DataFrame, direction: StudyDirection = StudyDirection.MAXIMIZE, number: int | None = None
+) -> pd.DataFrame:
+    """
+    A trial, None for the best one, and all its ancestors, the latest first. ``gain`` is the score less that of the best
+    parent.
+    """
+    numbers = set(ranked(table, direction)["number"][:1]) if number is None else {number}
+    for earlier in range(max(numbers, default=-1), -1, -1):
+        if earlier in numbers:
+            numbers |= set(table["parents"][earlier])
     line = table.loc[sorted(numbers, reverse=True)].set_index("number")
     best = pd.Series.max if direction == StudyDirection.MAXIMIZE else pd.Series.min
     before = [best(table["score"][parents]) if parents else np.nan for parents in line["parents"]]

@@ -1,10 +1,11 @@
 """Cross-validation of a search's best candidates (paper, A.4): the best on one environment may have overfitted to it."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import optuna
 import pandas as pd
@@ -14,7 +15,7 @@ from sb3_aarl.search.evolution.racing import next_runs, standings
 from sb3_aarl.search.evolution.surrogate import TokenModel
 from sb3_aarl.search.execution.matrix import Cell, Matrix, scores
 from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
-from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig
+from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig, merge_space
 from sb3_aarl.search.studies.search import check_study, search_matrix, stored_settings
 from sb3_aarl.search.training.config import ConfigError
 
@@ -44,6 +45,13 @@ def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLos
     return losses[:top] + by_rating(losses[top:])[:top_rated]
 
 
+def searched_values(config: SearchConfig, study: optuna.Study, loss: AuxLoss) -> dict[str, Any]:
+    """The values of the search's ``space`` in the best trial of a loss."""
+    scored = ranked(analysed(trial_table(study.get_trials(deepcopy=False))), study.direction)
+    others = scored.loc[scored["canonical"] == loss, "others"].iloc[0]
+    return {name: others[name] for name in config.space}
+
+
 def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselines: Sequence[Baseline] = ()) -> Matrix:
     """
     Candidates and baselines x environments x seeds.
@@ -55,7 +63,8 @@ def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselin
     if {*config.seeds} & {*section.seeds} and {*config.tasks} & {*(section.environments or config.tasks)}:
         logger.warning("cross_validation.seeds has seeds of the search: scores that candidates were chosen for count again")
     losses = top_losses(study, section.top, section.top_rated)
-    candidates = [Baseline(name=str(loss), aux_loss=loss) for loss in losses]
+    values = {loss: merge_space({}, searched_values(config, study, loss)) for loss in losses}
+    candidates = [Baseline(name=str(loss), aux_loss=loss, overrides=values[loss]) for loss in losses]
     n_more = section.budget - len(section.seeds) if section.budget else 0
     return _make_matrix(config, folder, [*candidates, *baselines], candidates, n_more)
 
@@ -138,14 +147,15 @@ def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     return by_environment.join(overall).dropna(subset="mean").sort_values("mean", ascending=False, kind="stable")
 
 
-def write_winner(table: pd.DataFrame, path: Path) -> AuxLoss:
+def write_winner(table: pd.DataFrame, path: Path, values: Mapping[str, Any] | None = None) -> AuxLoss:
     """
     Write the best candidate of a :func:`ranking` as YAML, a mapping whose ``aux_loss`` is what SACAux and hyper-parameter
-    files take, and return it.
+    files take, and return it. ``values``, of what was searched beside it, are a comment.
     """
     winner = AuxLoss.parse(str(table.index[0]))
     mean, runs, p_best = (table[name].iloc[0] for name in ("mean", "runs", "p_best"))
     comment = f"# Best of {len(table)} candidates in cross-validation: mean score {mean:.3f}, runs: {runs}, "
     comment += f"probability that it is the best of the table: {p_best:.2f}\n"
+    comment += "".join(f"# {name}: {value}\n" for name, value in (values or {}).items())
     replace_text(path, comment + yaml.safe_dump({"aux_loss": winner}, sort_keys=False))
     return winner
