@@ -18,6 +18,7 @@ from sb3_aarl.search.training.shipped import find_file
 from stable_baselines3.common.callbacks import BaseCallback
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from sb3_aarl import SACAux
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback
 
 DECAYS = (0.99, 0.997, 0.999)  # of each update of the actor, which is every third agent step
@@ -26,6 +27,7 @@ DECAYS = (0.99, 0.997, 0.999)  # of each update of the actor, which is every thi
 class Averages(BaseCallback):
     """Averages of the actor and of the encoder that it reads."""
 
+    model: SACAux
     averages: dict[float, AveragedModel]
 
     def _on_training_start(self) -> None:
@@ -66,7 +68,7 @@ def main() -> None:
         row = {"env": args.env, "seed": args.seed, "steps": evaluation.environment_steps}
         row |= {"actor": round(evaluation.mean, 2), "actor_std": round(evaluation.std, 2)}
         for decay, average in averages.averages.items():
-            model.policy.actor = average.module
+            model.policy.actor = average.module  # type: ignore[assignment]
             returns = callback._episode_returns(seed + 1000 * (len(callback.curve) - 1))
             row |= {str(decay): round(float(np.mean(returns)), 2), f"{decay}_std": round(float(np.std(returns)), 2)}
         model.policy.actor = model.actor
