@@ -52,7 +52,8 @@ ANALYSES = {
 def texts() -> dict[Path, str]:
     """All files that this script writes, and their text."""
     read = yaml.safe_load((RESULTS / "tables.yml").read_text("utf-8"))
-    tables = {name: sentence(part) if isinstance(part, str) else readme_table(part) for name, part in read.items()}
+    tasks = [row for row in read["headline"].values() if isinstance(row[-1], int)]
+    tables = {name: sentence(part, tasks) if isinstance(part, str) else readme_table(part) for name, part in read.items()}
     abouts = sorted(RESULTS.glob("*/*/about.md"))
     tables["index"] = markdown([("experiment", "question", "answer"), *map(summary, abouts)])
     files = {path: filled(path.read_text(encoding="utf-8"), tables) for path in PAGES}
@@ -86,26 +87,36 @@ def proof_row(name: str, values: list[str]) -> list[str]:
     """A row of the main table: our runs where there are some, else a published mean, else a dash."""
     if len(values) > len(PROVED):
         return [name, *values]
-    task, sac, crossq, best = values
+    task, sac, crossq, best, _ = values
     published = {"sac": sac, "crossq": crossq}
     folders = {variant: f"agent/proof/runs/{variant}/{task}" for variant in PROVED.values()}
     cells = [folder if (RESULTS / folder).exists() else published.get(variant, "-") for variant, folder in folders.items()]
     return [name, *cells, best]
 
 
-def sentence(text: str) -> str:
-    """A text of tables.yml; a folder in braces becomes the mean of its last returns, with "seeds" before it their number."""
+def sentence(text: str, rows: Iterable[list[Any]]) -> str:
+    """
+    A text of tables.yml. Of the tasks of the main table that have runs, ``{tasks}`` is the number, ``{share}`` and ``{times}`` the
+    medians of the mean return over DR.Q's and over SAC's.
+    """
+    found = []
+    for task, sac, _, _, drq in rows:
+        if last := last_returns(RESULTS / "agent/proof/runs/sac_aux" / task):
+            mean = statistics.mean(last)
+            found.append((mean / drq, mean / float(sac.strip("_").partition(" ")[0].replace(",", ""))))
+    share, times = map(statistics.median, zip(*found, strict=True))
+    text = text.format(tasks=len(found), share=f"{share:.2f}", times=f"{times:.1f}")
+    return textwrap.fill(text, 126, break_on_hyphens=False)
 
-    def figure(found: re.Match[str]) -> str:
-        mean, *_, number = returns(RESULTS / found[2]).split()
-        return f"{number.strip('()')} {'seed' if number == '(1)' else 'seeds'}" if found[1] else mean
 
-    return textwrap.fill(re.sub(r"\{(seeds )?([\w-]+/[\w/-]+)\}", figure, text), 126, break_on_hyphens=False)
+def last_returns(folder: Path) -> list[float]:
+    """The last returns of the runs in a folder, one for each seed."""
+    return [read_curve(path)[-1].mean for path in folder.glob("seed-*/curve.csv")]
 
 
 def returns(folder: Path) -> str:
-    """The last returns of the runs in a folder, one for each seed: mean, deviation, number."""
-    last = [read_curve(path)[-1].mean for path in folder.glob("seed-*/curve.csv")]
+    """The last returns of the runs in a folder: mean, deviation, number."""
+    last = last_returns(folder)
     deviation = f" ± {statistics.stdev(last):,.0f}" if len(last) > 1 else ""
     return f"{statistics.mean(last):,.0f}{deviation} ({len(last)})"
 
