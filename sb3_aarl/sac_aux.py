@@ -572,10 +572,7 @@ class SACAux(SAC):
             given = load_from_zip_file(given, device=device, load_data=False)[1]
         own, auxiliary = self.get_parameters(), {"aux_head", "aux_optimizer"}
         if _shapes(own.get("aux_head", {})) != _shapes(given.get("aux_head", {})):
-            if self.aux_head is not None:
-                logger.warning(
-                    "no parameters of this model's aux_loss (%s) are given: its own stay as they are", self.aux_loss
-                )
+            logger.warning("no parameters of this model's aux_loss (%s) are given: its own stay as they are", self.aux_loss)
             given = {name: value for name, value in given.items() if name not in auxiliary}
             given |= {name: own[name] for name in auxiliary & own.keys()}
         key = "critic.optimizer"
