@@ -7,6 +7,7 @@ import re
 import types
 import warnings
 from collections.abc import Iterator
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -395,6 +396,14 @@ def test_extend_and_reset_as_sb3_does():
         assert ours.size() == theirs.size() == 0
         with pytest.raises(NoWindowError):
             ours.sample_windows(1, 1)
+
+
+def test_observations_of_another_layout_are_refused():
+    space = spaces.Box(0, 255, (3, 8, 10), np.uint8)
+    for image, is_right in ((np.zeros((1, 8, 10, 3), np.uint8), False), (np.zeros((1, 3, 8, 10), np.uint8), True)):
+        for buffer in (ReplayBuffer(5, space, ACTIONS), WindowReplayBuffer(5, space, ACTIONS)):
+            with nullcontext() if is_right else pytest.raises(ValueError, match="shape"):
+                buffer.add(image, image, np.zeros((1, 2)), np.zeros(1), np.zeros(1), [{}])
 
 
 def test_what_was_before_a_reset_is_gone_even_inside_of_an_episode():
