@@ -96,8 +96,8 @@ def proof_row(name: str, values: list[str]) -> list[str]:
 
 def sentence(text: str, rows: Iterable[list[Any]]) -> str:
     """
-    A text of tables.yml. Of the tasks of the main table that have runs, ``{tasks}`` is the number, ``{share}`` and ``{times}`` the
-    medians of the mean return over DR.Q's and over SAC's.
+    A text of tables.yml. Of the tasks of the main table that have runs, ``{tasks}`` is the number, ``{share}`` and ``{times}``
+    the medians of the mean return over DR.Q's and over SAC's.
     """
     found = []
     for task, sac, _, _, drq in rows:
