@@ -87,8 +87,7 @@ class SACAux(SAC):
     :param precision: ``"fp32"``, or ``"bf16"``: in training the networks compute in bfloat16; parameters, optimizers, Q
         targets, entropy, losses and predictions stay float32. A device without instructions for it (of x86 processors those
         without AVX-512) would be ten times slower: it computes in float32, and logs a warning
-    :param compile: Whether ``torch.compile`` compiles the losses in the first gradient steps, which takes two minutes.
-        On a CPU it gains 7 % at most (benchmarks/README.md)
+    :param compile: Whether ``torch.compile`` compiles the losses, which takes two minutes and gains 7 % at most on a CPU
     :raises ValueError: for arguments that do not fit, with the culprit's name
 
     Training stops with :class:`NonFiniteError` where something is NaN or infinite, and with

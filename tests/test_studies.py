@@ -22,7 +22,6 @@ from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.config import SearchConfig, load_config
 from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, planned_runs, runs_of
-from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError
 from tiny import SEARCH, write_search
 
@@ -122,25 +121,6 @@ def test_a_search_from_python(config: SearchConfig, tmp_path: Path, executor: Pl
     (tmp_path / "other.yml").write_text(config.path.read_text())
     with pytest.raises(ValueError, match="mine is the folder of the search small"):
         Search.from_file(tmp_path / "other.yml", tmp_path / "mine").run(executor)
-
-
-def test_a_file_is_read_once_and_its_settings_are_checked_once(
-    config: SearchConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor: Planted
-) -> None:
-    read, checked = [], []
-
-    def count(name: str, calls: list[Any]) -> None:
-        function = getattr(training, name)
-        monkeypatch.setattr(training, name, lambda *arguments: calls.append(arguments) or function(*arguments))
-
-    count("read_yaml", read)
-    count("check_hyperparameters", checked)
-    search = Search.from_file(config.path, tmp_path / "mine", generations=1)
-    search.run(executor)
-    baselines(search.config, tmp_path)
-    assert [Path(path).name for (path,) in read] == ["small.yml", "hyperparameters.yml"]
-    # Two environments, and the overrides of a baseline on both.
-    assert len(checked) == 4
 
 
 def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None:
