@@ -106,6 +106,11 @@ def test_center_crop(height: int, width: int, size: int, corner: tuple[int, int]
     assert cropped.dtype == dtype
 
 
+def test_default_sizes_are_the_papers() -> None:
+    images = pictures(2, 9, 100, 100, th.uint8)
+    assert random_crop(images).shape == center_crop(images).shape == (2, 9, 84, 84)
+
+
 @pytest.mark.parametrize("crop", [random_crop, center_crop])
 @pytest.mark.parametrize("shape", [(2, 3, 83, 84), (2, 3, 84, 83), (3, 84, 84)])
 def test_images_that_are_too_small(crop, shape: tuple[int, ...]) -> None:

@@ -193,3 +193,9 @@ def test_published_losses_are_the_papers() -> None:
         loss = losses[tuple(map(int, where))]
         assert as_sets(loss) == read_latex(printed)
         assert loss.latex() == printed
+
+
+def test_the_two_chosen_losses_are_published_candidates() -> None:
+    # Appendix D.1 calls AARL-Pixel a candidate of generation 4, but table 9 marks the one of generation 5.
+    for name, printed in {"aarl-pixel": (9, 5, 3), "aarl-state": (12, 4, 4)}.items():
+        assert [(p.table, p.generation, p.rank) for p in catalog.published() if p.loss == catalog.load(name)] == [printed]

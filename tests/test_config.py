@@ -105,6 +105,12 @@ def test_a_search_without_hyperparameters_has_those_of_aarl_train(tmp_path: Path
     assert trained["env_kwargs"] == {"action_repeat": 2}
 
 
+def test_all_searches_of_one_kind_have_the_same_baselines() -> None:
+    for kind in ("state", "pixel"):
+        baselines = {str(load_config(path).baselines) for path in SEARCHES if kind in path.stem}
+        assert len(baselines) == 1
+
+
 # Searches.
 
 

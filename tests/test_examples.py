@@ -18,6 +18,11 @@ LAST = {
 }
 
 
+def test_all_are_here() -> None:
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*LAST}
+    assert all(len(path.read_text(encoding="utf-8").splitlines()) <= 60 for path in EXAMPLES.glob("*.py"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAST)
 def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

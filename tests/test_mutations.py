@@ -50,6 +50,16 @@ def test_replacement_flips_each_bit_independently_with_half_a_flip_in_each_mask(
     assert chisquare([*observed[common], observed[~common].sum()], [*expected[common], expected[~common].sum()]).pvalue > 0.001
 
 
+@pytest.mark.parametrize("horizon", [3, 10])
+def test_replacement_of_long_losses(horizon: int) -> None:
+    # So many bits are set that rejection plays no part.
+    parent = AuxLoss(horizon, (True,) * (3 * horizon + 1), (True, False) * (3 * horizon // 2) + (True,) * (1 + horizon % 2))
+    n_bits, rng = 2 * (3 * horizon + 1), np.random.default_rng(1)
+    flips = np.array([as_array(replacement(parent, rng)) != as_array(parent) for _ in range(4000)])
+    for bit in flips.reshape(4000, n_bits).T:
+        assert binomtest(int(bit.sum()), 4000, 1 / n_bits).pvalue > 0.001 / n_bits
+
+
 @given(losses(), losses(), seeds)
 def test_crossover_takes_every_bit_from_one_of_both(loss: AuxLoss, other: AuxLoss, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -76,6 +76,15 @@ def test_the_posterior_is_that_of_the_priors() -> None:
     )
 
 
+def test_with_many_seeds_the_posterior_is_that_of_the_means() -> None:
+    truth, rng = np.array([100.0, 103.0, 110.0]), np.random.default_rng(1)
+    scores = truth[:, None] + 5 * rng.normal(size=(3, 400))
+    found = standings(1e3 * scores)
+    np.testing.assert_allclose(found.mean, 1e3 * scores.mean(axis=1), atol=50)
+    np.testing.assert_allclose(found.high - found.low, 1e3 * 2 * 1.96 * 5 / 20, rtol=0.1)
+    assert found.p_best[2] > 0.999
+
+
 def test_losses_without_runs_and_equal_scores() -> None:
     found = standings(np.array([[np.nan, np.nan], [3.0, np.nan]]))
     np.testing.assert_array_equal(

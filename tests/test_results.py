@@ -1,5 +1,6 @@
 """The tables are those of the runs in results/, the texts are right about them, and the commands there work."""
 
+import itertools
 import re
 import runpy
 import shlex
@@ -65,6 +66,12 @@ def test_a_cell_is_mean_deviation_and_number_of_the_last_returns(tmp_path: Path)
             tmp_path / f"seed-{seed}" / "curve.csv", [Evaluation(step, step * last, 1.0, 1, 1.0) for step in (2, 1)][::-1]
         )
     assert make_tables["returns"](tmp_path) == "4,000 ± 2,000 (3)"
+
+
+def test_mean_of_the_best_of_some_scores() -> None:
+    scores = [3.0, 1.0, 4.0, 1.0, 5.0, 9.0]
+    best = [max(drawn) for drawn in itertools.combinations(scores, 3)]
+    assert make_tables["mean_of_best"](scores, 3) == pytest.approx(statistics.mean(best))
 
 
 @pytest.mark.parametrize("path", ABOUTS, ids=lambda path: path.parent.name)

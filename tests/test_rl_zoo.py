@@ -171,6 +171,13 @@ def test_one_error_for_a_file_that_cannot_be_used(
     assert re.search(rf"error: {path}: .*{message}", capsys.readouterr().err)
 
 
+@pytest.mark.parametrize("text", ["default: {env_kwargs: }", "default: {batch_size: 8}", "a: {}"])
+def test_no_arguments_of_the_environment(text: str, tmp_path: Path) -> None:
+    (tmp_path / "own.yml").write_text(text)
+    arguments = [*SAC_AUX, "-conf", str(tmp_path / "own.yml")]
+    assert with_env_kwargs(arguments) == arguments
+
+
 def test_without_a_file_it_has_the_defaults() -> None:
     arguments = with_env_kwargs(SAC_AUX)
     assert Path(arguments[arguments.index("-conf") + 1]) == ZOO / "sac_aux.yml" and added(arguments) == {"action_repeat": 2}

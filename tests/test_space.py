@@ -9,6 +9,7 @@ import optuna
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from optuna.distributions import CategoricalDistribution, IntDistribution
 from optuna.samplers import BaseSampler, RandomSampler, TPESampler
 from optuna.trial import FixedTrial, TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler
@@ -37,6 +38,17 @@ def losses(draw: st.DrawFn, max_horizon: int = 4, operators: tuple[str, ...] = O
     bits = st.lists(st.booleans(), min_size=3 * horizon + 1, max_size=3 * horizon + 1)
     source, target = draw(bits.filter(lambda mask: any(mask[::3]))), draw(bits.filter(any))
     return AuxLoss(horizon, tuple(source), tuple(target), draw(st.sampled_from(operators)), draw(st.booleans()))
+
+
+def test_the_parameters_are_one_boolean_for_each_token_of_the_horizon() -> None:
+    tokens = ["s_t", "a_t", "r_t", "s_t+1", "a_t+1", "r_t+1", "s_t+2"]
+    space = distributions(2, max_horizon=5)
+    assert list(space) == ["horizon", *(f"source/{token}" for token in tokens), *(f"target/{token}" for token in tokens)]
+    assert space["horizon"] == IntDistribution(1, 5)
+    assert all(value == CategoricalDistribution([False, True]) for name, value in space.items() if name != "horizon")
+    searched = distributions(1, operators=("mse", "inner"))
+    assert searched["operator"] == CategoricalDistribution(["mse", "inner"])
+    assert searched["negatives"] == CategoricalDistribution([False, True])
 
 
 @given(losses())

@@ -22,6 +22,7 @@ from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.config import SearchConfig, load_config
 from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, planned_runs, runs_of
+from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError
 from tiny import SEARCH, write_search
 
@@ -123,6 +124,25 @@ def test_a_search_from_python(config: SearchConfig, tmp_path: Path, executor: Pl
         Search.from_file(tmp_path / "other.yml", tmp_path / "mine").run(executor)
 
 
+def test_a_file_is_read_once_and_its_settings_are_checked_once(
+    config: SearchConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor: Planted
+) -> None:
+    read, checked = [], []
+
+    def count(name: str, calls: list[Any]) -> None:
+        function = getattr(training, name)
+        monkeypatch.setattr(training, name, lambda *arguments: calls.append(arguments) or function(*arguments))
+
+    count("read_yaml", read)
+    count("check_hyperparameters", checked)
+    search = Search.from_file(config.path, tmp_path / "mine", generations=1)
+    search.run(executor)
+    baselines(search.config, tmp_path)
+    assert [Path(path).name for (path,) in read] == ["small.yml", "hyperparameters.yml"]
+    # Two environments, and the overrides of a baseline on both.
+    assert len(checked) == 4
+
+
 def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None:
     study = optuna.create_study(sampler=AuxLossSampler(**config.sampler_settings()))
     make_runs = runs_of(config.model_copy(update={"seeds": (4, 9), "imports": ("json",), "threads": 2}))
@@ -171,10 +191,8 @@ def test_a_search_on_several_environments_and_of_hyperparameters(tmp_path: Path,
     assert {trial.params["batch_size"] for trial in search.study.trials} <= {8, 16}
     # The best is cross-validated with the values that it had.
     matrix = cross_validation.make_matrix(search.config, search.study, tmp_path)
-    best, values = (
-        search.study.best_trial,
-        cross_validation.searched_values(search.config, search.study, loss_of(search.study.best_trial).canonical()),
-    )
+    best = search.study.best_trial
+    values = cross_validation.searched_values(search.config, search.study)[loss_of(best).canonical()]
     assert values == {name: best.params[name] for name in ("batch_size", "learning_rate")}
     assert len(matrix.runs) == 6 and all(run.hyperparameters.items() >= values.items() for run in matrix.runs.values())
 

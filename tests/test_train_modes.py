@@ -127,6 +127,20 @@ def test_compiled_losses_have_the_same_gradients(
     assert type(model).load(tmp_path / "model").compile
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [{}, {"foreach": True}, {"fused": False}, {"eps": 1e-3}], ids=str)
+def test_adam_is_fused_unless_the_user_says_how(given: dict[str, Any]) -> None:
+    model = make_model(policy_kwargs={"optimizer_kwargs": given})
+    for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer):
+        assert optimizer.defaults["fused"] == (given.get("fused") if {"foreach", "fused"} & set(given) else True)
+        assert optimizer.defaults["eps"] == given.get("eps", 1e-8)
+    model = make_model(policy_kwargs={"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.5}})
+    for optimizer in (model.actor.optimizer, model.critic.optimizer, model.aux_optimizer):
+        assert type(optimizer) is th.optim.AdamW and optimizer.param_groups[0]["weight_decay"] == 0.5
+    identity = {"features_extractor_class": "identity", "features_extractor_kwargs": {}}
+    assert not make_model(policy_kwargs=identity, aux_loss=None).critic.optimizer.defaults["fused"]
+
+
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
