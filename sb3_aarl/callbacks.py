@@ -160,7 +160,7 @@ class LearningCurveCallback(BaseCallback):
             write_curve(self.path, self.curve)
         self.logger.record("eval/mean_reward", evaluation.mean)
         self.logger.record("eval/environment_steps", evaluation.environment_steps)
-        self.logger.dump(self.num_timesteps)
+        self.model.dump_logs()  # SB3 does so every fourth episode: here the log has losses and episodes at each evaluation
         if self.verbose:
             print(f"{evaluation.environment_steps:>9,} environment steps: {evaluation.mean:7.1f} +- {evaluation.std:.1f}")
         return self.on_evaluation is None or self.on_evaluation(evaluation) is not False

@@ -128,12 +128,10 @@ def cross_validate(
     """Train the best candidates of a search on several environments, and write the winner as YAML."""
     execution = options.Execution(executor, ray_address, slurm, cpus_per_run, gpus_per_run)
 
-    from sb3_aarl.search.evolution.space import with_values
+    from sb3_aarl.search.evolution.space import described
     from sb3_aarl.search.execution.storage import load_study, open_storage
     from sb3_aarl.search.studies import cross_validation
     from sb3_aarl.search.studies.search import Search
-
-    from sb3_aarl.aux_loss import AuxLoss
 
     found = Search.from_file(config, folder, threads=threads)
     settings, path = found.config, found.folder
@@ -143,9 +141,9 @@ def cross_validate(
     table = compare(matrix, "Cross-validation, AULC: posterior mean, 95 % interval, probability to be the best")
     names = [baseline.name for baseline in settings.baselines]
     if not (candidates := table.drop(index=names, errors="ignore")).empty:
-        values = cross_validation.searched_values(settings, searched, AuxLoss.parse(str(candidates.index[0])))
+        values = cross_validation.searched_values(settings, searched)
         winner = cross_validation.write_winner(candidates, path / "winner.yml", values)
-        say(f"Winner: {winner}{with_values(values)}\nAs YAML: {path / 'winner.yml'}")
+        say(f"Winner: {described(winner, values[winner])}\nAs YAML: {path / 'winner.yml'}")
         if table["mean"].iloc[0] > candidates["mean"].iloc[0]:
             say(f"The mean of {table.index[0]}, a baseline, is higher.")
     exit_if_failed(matrix)

@@ -274,12 +274,7 @@ class _Slots:
             else:
                 self.failed[generation, slot] += 1
         elif trial.state == TrialState.COMPLETE or loss is not None:  # what was pruned as invalid fills no slot
-            # Of a pruned trial the value is its last report, which is not the mean of a whole curve.
-            score = self.sign * trial.value if trial.state == TrialState.COMPLETE and trial.value is not None else math.nan
-            is_feasible = all(value <= 0 for value in trial.constraints.values())
-            result = None
-            if loss is not None:
-                result = Result(trial.number, loss, score if is_feasible and math.isfinite(score) else math.nan)
+            result = None if loss is None else Result(trial.number, loss, self.sign * space.score_of(trial))
             if generation >= self.candidates.generation:
                 self.results[generation].setdefault(slot, result)
             elif result is not None:

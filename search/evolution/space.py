@@ -1,6 +1,7 @@
 """The search space: AuxLoss to and from Optuna parameters, and losses drawn at random and from the paper's priors."""
 
 import contextlib
+import math
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
-from optuna.trial import BaseTrial, FixedTrial, FrozenTrial
+from optuna.trial import BaseTrial, FixedTrial, FrozenTrial, TrialState
 
 from sb3_aarl.aux_loss import LONGEST_HORIZON, OPERATORS, AuxLoss, Token
 
@@ -92,10 +93,25 @@ def other_params(params: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in params.items() if name not in own and not name.startswith(("source/", "target/"))}
 
 
-def with_values(values: Mapping[str, Any]) -> str:
-    """Such values as text after that of a loss, numbers rounded."""
-    texts = [f"{name}={value:.4g}" if isinstance(value, float) else f"{name}={value}" for name, value in values.items()]
-    return f", with {', '.join(texts)}" if values else ""
+def values_text(values: Mapping[str, Any]) -> str:
+    """Such values as text, numbers rounded."""
+    return ", ".join(
+        f"{name}={value:.4g}" if isinstance(value, float) else f"{name}={value}" for name, value in values.items()
+    )
+
+
+def described(loss: AuxLoss | None, values: Mapping[str, Any]) -> str:
+    """A loss as text, with the values that were searched beside it."""
+    return f"{loss}, with {values_text(values)}" if values else str(loss)
+
+
+def score_of(trial: FrozenTrial) -> float:
+    """
+    The value of a trial; NaN if it is not complete or violates a constraint, or the value is not finite. That of a pruned
+    trial is its last report, which is not the mean of a whole curve.
+    """
+    is_scored = trial.state == TrialState.COMPLETE and all(value <= 0 for value in trial.constraints.values())
+    return trial.value if is_scored and trial.value is not None and math.isfinite(trial.value) else math.nan
 
 
 def loss_of(trial: FrozenTrial) -> AuxLoss | None:

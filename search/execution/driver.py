@@ -15,7 +15,7 @@ import optuna
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
-from sb3_aarl.search.evolution.space import loss_of, other_params, with_values
+from sb3_aarl.search.evolution.space import described, loss_of, other_params
 from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.matrix import scaled, task_folder
 from sb3_aarl.search.execution.queue import Job, Queue, seconds_to_go
@@ -253,7 +253,7 @@ def search_progress(study: optuna.Study, generations: list[GenerationProgress]) 
     return SearchProgress(
         generations,
         None if best is None else best.value,
-        None if best is None else f"{loss_of(best)}{with_values(other_params(best.params))}",
+        None if best is None else described(loss_of(best), other_params(best.params)),
         seconds_to_go(seconds, left, sum(generation.running for generation in generations)),
     )
 

@@ -1,6 +1,5 @@
 """What a search teaches about auxiliary losses (paper, section 3.3, B.2, B.3): functions of trials or of a table of them."""
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,8 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial, TrialState
-from sb3_aarl.search.evolution.space import loss_of, other_params
+from optuna.trial import FrozenTrial
+from sb3_aarl.search.evolution.space import loss_of, other_params, score_of
 from scipy.stats import ttest_ind
 
 from sb3_aarl import catalog
@@ -47,10 +46,6 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     rows = []
     for trial in trials:
         loss = loss_of(trial)
-        is_feasible = all(value <= 0 for value in trial.constraints.values())
-        has_score = (
-            trial.state == TrialState.COMPLETE and is_feasible and trial.value is not None and math.isfinite(trial.value)
-        )
         row = {
             "number": trial.number,
             "state": "interrupted" if trial.user_attrs.get("interrupted") else trial.state.name.lower(),
@@ -58,7 +53,7 @@ def trial_table(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
             "generation": trial.user_attrs.get("generation", 1),
             "operation": trial.user_attrs.get("operation", "-"),
             "parents": list(trial.user_attrs.get("parents", ())),
-            "score": trial.value if has_score else np.nan,
+            "score": score_of(trial),
             "loss": loss,
             "canonical": None if loss is None else loss.canonical(),
             "curve": trial.user_attrs.get("curve", []),
@@ -189,8 +184,10 @@ def machines(trials: Sequence[FrozenTrial]) -> pd.DataFrame:
     return groups.size().to_frame("trials").join(sums)
 
 
-def summary(trials: Sequence[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE) -> dict[str, pd.DataFrame]:
-    """Everything above for one study by name; ``operator`` only if it was searched."""
+def summary(
+    trials: Sequence[FrozenTrial], direction: StudyDirection = StudyDirection.MAXIMIZE, best: int | None = None
+) -> dict[str, pd.DataFrame]:
+    """Everything above for one study by name, ``best`` as for ``lineage``; ``operator`` only if it was searched."""
     table = trial_table(trials)
     operator = ["operator", "negatives"]
     tables = {
@@ -198,7 +195,7 @@ def summary(trials: Sequence[FrozenTrial], direction: StudyDirection = StudyDire
         "horizon": effects(table, "horizon"),
         "operator": effects(table, operator) if len(analysed(table)[operator].drop_duplicates()) > 1 else None,
         "operation": effects(table, "operation"),
-        "lineage": lineage(table, direction),
+        "lineage": lineage(table, direction, best),
         "machines": machines(trials),
     }
     return {name: found for name, found in tables.items() if found is not None}

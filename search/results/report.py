@@ -12,7 +12,7 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from optuna import Study
-from sb3_aarl.search.evolution.space import with_values
+from sb3_aarl.search.evolution.space import values_text
 from sb3_aarl.search.execution.matrix import stored_scores, task_name
 from sb3_aarl.search.results import analysis
 from sb3_aarl.search.results.plots import evolution_plot
@@ -56,9 +56,7 @@ def write_report(
         order = cross_validation.top_losses(study, len(best))
         best = best.drop_duplicates("canonical").sort_values("canonical", key=lambda losses: losses.map(order.index))
     title, baselines = study.study_name, list(baselines)
-    tables = analysis.summary(trials, study.direction)
-    if len(best):
-        tables["lineage"] = analysis.lineage(table, study.direction, int(best["number"].iloc[0]))
+    tables = analysis.summary(trials, study.direction, int(best["number"].iloc[0]) if len(best) else None)
     started = [f"{trial.datetime_start:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_start]
     ended = [f"{trial.datetime_complete:%Y-%m-%d %H:%M}" for trial in trials if trial.datetime_complete]
     environment = jinja2.Environment(
@@ -91,7 +89,7 @@ def _candidates(table: pd.DataFrame) -> pd.DataFrame:
     text = analysis.readable(table.set_index("number")[["score", "generation", "operation", "parents"]])
     text.insert(0, "Loss", [Markup("<code>{}</code>").format(loss or "no loss") for loss in table["loss"]])
     if any(table["others"]):
-        text.insert(1, "With", [with_values(others).removeprefix(", with ") for others in table["others"]])
+        text.insert(1, "With", [values_text(others) for others in table["others"]])
     return text
 
 

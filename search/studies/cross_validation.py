@@ -45,11 +45,11 @@ def top_losses(study: optuna.Study, top: int, top_rated: int = 0) -> list[AuxLos
     return losses[:top] + by_rating(losses[top:])[:top_rated]
 
 
-def searched_values(config: SearchConfig, study: optuna.Study, loss: AuxLoss) -> dict[str, Any]:
-    """The values of the search's ``space`` in the best trial of a loss."""
-    scored = ranked(analysed(trial_table(study.get_trials(deepcopy=False))), study.direction)
-    others = scored.loc[scored["canonical"] == loss, "others"].iloc[0]
-    return {name: others[name] for name in config.space}
+def searched_values(config: SearchConfig, study: optuna.Study) -> dict[AuxLoss, dict[str, Any]]:
+    """The values of the search's ``space`` in the best trial of each loss."""
+    scored = ranked(analysed(trial_table(study.get_trials(deepcopy=False))), study.direction).drop_duplicates("canonical")
+    pairs = zip(scored["canonical"], scored["others"], strict=True)
+    return {loss: {name: others[name] for name in config.space} for loss, others in pairs}
 
 
 def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselines: Sequence[Baseline] = ()) -> Matrix:
@@ -62,9 +62,8 @@ def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselin
     check_study(study, config, free=("threads",))
     if {*config.seeds} & {*section.seeds} and {*config.tasks} & {*(section.environments or config.tasks)}:
         logger.warning("cross_validation.seeds has seeds of the search: scores that candidates were chosen for count again")
-    losses = top_losses(study, section.top, section.top_rated)
-    values = {loss: merge_space({}, searched_values(config, study, loss)) for loss in losses}
-    candidates = [Baseline(name=str(loss), aux_loss=loss, overrides=values[loss]) for loss in losses]
+    losses, values = top_losses(study, section.top, section.top_rated), searched_values(config, study)
+    candidates = [Baseline(name=str(loss), aux_loss=loss, overrides=merge_space({}, values[loss])) for loss in losses]
     n_more = section.budget - len(section.seeds) if section.budget else 0
     return _make_matrix(config, folder, [*candidates, *baselines], candidates, n_more)
 
@@ -147,15 +146,15 @@ def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     return by_environment.join(overall).dropna(subset="mean").sort_values("mean", ascending=False, kind="stable")
 
 
-def write_winner(table: pd.DataFrame, path: Path, values: Mapping[str, Any] | None = None) -> AuxLoss:
+def write_winner(table: pd.DataFrame, path: Path, values: Mapping[AuxLoss, Mapping[str, Any]] | None = None) -> AuxLoss:
     """
     Write the best candidate of a :func:`ranking` as YAML, a mapping whose ``aux_loss`` is what SACAux and hyper-parameter
-    files take, and return it. ``values``, of what was searched beside it, are a comment.
+    files take, and return it. Its values of :func:`searched_values` are a comment.
     """
     winner = AuxLoss.parse(str(table.index[0]))
     mean, runs, p_best = (table[name].iloc[0] for name in ("mean", "runs", "p_best"))
     comment = f"# Best of {len(table)} candidates in cross-validation: mean score {mean:.3f}, runs: {runs}, "
     comment += f"probability that it is the best of the table: {p_best:.2f}\n"
-    comment += "".join(f"# {name}: {value}\n" for name, value in (values or {}).items())
+    comment += "".join(f"# {name}: {value}\n" for name, value in (values or {}).get(winner, {}).items())
     replace_text(path, comment + yaml.safe_dump({"aux_loss": winner}, sort_keys=False))
     return winner

@@ -89,7 +89,6 @@ def _train(folder: Path, run: Run, on_evaluation: Callable[[list[Evaluation]], o
         )
 
         def report() -> None:
-            model.dump_logs()  # as SB3 does every fourth episode: TensorBoard has losses and episodes at each evaluation
             write_curve(folder / CURVE, evaluations.curve)
             on_evaluation(evaluations.curve)
 
