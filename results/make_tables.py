@@ -34,7 +34,7 @@ SOURCE = "results/make_tables.py"
 GUIDES = ("expect.md", "from_sac.md", "losses.md", "paper.md", "results.md")
 PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in GUIDES)]
 # The columns of the main table, and their variants in agent/proof/runs.
-PROVED = {"SACAux": "sac_aux", "before": "momentum_0.01", "no loss": "no_loss", "SAC": "sac", "CrossQ": "crossq", "TQC": "tqc"}
+PROVED = {"SACAux": "sac_aux", "no loss": "no_loss", "SAC": "sac", "CrossQ": "crossq", "TQC": "tqc"}
 # What a search does to losses; the others are drawn at random, from priors, or given.
 EVOLVED = ("crossover", "replacement", "horizon_change")
 DRAWN, BEST = 20, 10
