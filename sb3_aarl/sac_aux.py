@@ -55,8 +55,8 @@ class SACAux(SAC):
     of the target critic is the momentum encoder of the auxiliary loss. Arguments that are not here are SB3's.
 
     Defaults that are not SAC's are CrossQ's (learning rate, updates of the actor, batch norm in the Q networks, here with
-    target networks), SimBa's (entropy) and MR.Q's (three-step returns). With all of SAC's and ``aux_loss=None`` it is SB3's
-    SAC, to the bit: ``zoo_configs/sac.yml`` has them.
+    target networks) and SimBa's (entropy, random steps). With all of SAC's and ``aux_loss=None`` it is SB3's SAC, to the
+    bit: ``zoo_configs/sac.yml`` has them.
 
     :param policy: ``"MlpPolicy"`` (``simba`` encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
@@ -71,7 +71,6 @@ class SACAux(SAC):
     :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. If one that
         was detected does not hold, a warning is raised and whole observations are stored
     :param optimize_memory_usage: Accepted for SB3; the buffer stores each frame once anyway
-    :param n_steps: Steps of n-step returns; None (default) for 3, and for 1 with a buffer that is no WindowReplayBuffer
     :param ent_coef: As in SB3; ``"auto_0.01"`` (default) learns it from 0.01 on
     :param target_entropy: As in SB3; ``"auto_0.5"`` (default) is half of what ``"auto"`` is
     :param target_update_interval: Gradient steps between updates of the target critic; SAC counts from 0 in each ``train``
@@ -120,7 +119,7 @@ class SACAux(SAC):
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: int | None = None,
+        n_steps: int = 1,
         ent_coef: str | float = "auto_0.01",
         target_update_interval: int = 1,
         target_entropy: str | float = "auto_0.5",
@@ -156,7 +155,7 @@ class SACAux(SAC):
             replay_buffer_class,
             replay_buffer_kwargs,
             optimize_memory_usage,
-            n_steps,  # type: ignore[arg-type]
+            n_steps,
             ent_coef,
             target_update_interval,
             target_entropy,
@@ -201,8 +200,6 @@ class SACAux(SAC):
             raise ValueError(f"aux_kwargs: {str(error).rpartition(' got ')[2]}; known: {known}") from None
         if self.replay_buffer_class is None:
             self.replay_buffer_class = WindowReplayBuffer
-        if self.n_steps is None:
-            self.n_steps = 3 if issubclass(self.replay_buffer_class, WindowReplayBuffer) else 1
         self._check_arguments()
         if isinstance(self.target_entropy, str) and self.target_entropy.startswith("auto_"):
             share = float(self.target_entropy.removeprefix("auto_"))

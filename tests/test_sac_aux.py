@@ -93,7 +93,6 @@ def make_model(
         "buffer_size": 300,
         "learning_starts": 20,
         "batch_size": 16,
-        "n_steps": 1,
         "policy_delay": 2,
         "target_entropy": "auto",
         "aux_loss": LOSS,
@@ -143,7 +142,7 @@ def sac_and_ours(policy: str, env: Callable[[], Any], steps: int, ours: dict[str
     sac = SAC(policy, env(), **both).learn(steps)
     sacs = {"critic_norm": None, "optimizer_kwargs": {"betas": (0.9, 0.999)}}
     ours = {**both, **ours, "policy_kwargs": {**sacs, **both["policy_kwargs"], **ours["policy_kwargs"]}}
-    ours = {"n_steps": 1, "target_entropy": "auto", **ours}
+    ours = {"target_entropy": "auto", **ours}
     return sac, SACAux(policy, env(), **{"aux_loss": None, "policy_delay": 1, **ours}).learn(steps)
 
 

@@ -129,7 +129,7 @@ def assert_equal_parameters(first: SACAux, second: SACAux) -> None:
 def test_defaults_are_those_of_sac(method: str) -> None:
     ours, sacs = (inspect.signature(getattr(cls, method)).parameters for cls in (SACAux, SAC))
     # Why: see the docstring of SACAux.
-    constructor = ["learning_rate", "learning_starts", "tau", "n_steps", "ent_coef", "target_entropy"]
+    constructor = ["learning_rate", "learning_starts", "tau", "ent_coef", "target_entropy"]
     changed = {"__init__": constructor, "learn": ["tb_log_name"]}[method]
     assert [name for name in sacs if ours[name].default != sacs[name].default] == changed
 

@@ -63,7 +63,6 @@ COMMON: dict[str, Any] = {
     "gamma": 0.99,
     "ent_coef": "auto_0.1",
     "policy_delay": 2,
-    "n_steps": 1,
     "target_entropy": "auto",
 }
 ADAM = {"net_arch": [1024, 1024], "optimizer_kwargs": {"betas": [0.9, 0.999]}, "critic_norm": None}
@@ -75,7 +74,6 @@ SB3_SAC: dict[str, Any] = {
     "aux_loss": None,
     "learning_rate": 3e-4,
     "learning_starts": 100,
-    "n_steps": 1,
     "ent_coef": "auto",
     "target_entropy": "auto",
     "tau": 0.005,
