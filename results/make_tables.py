@@ -34,7 +34,7 @@ SOURCE = "results/make_tables.py"
 GUIDES = ("expect.md", "from_sac.md", "losses.md", "paper.md", "results.md")
 PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in GUIDES)]
 # The columns of the main table, and their variants in agent/proof/runs.
-PROVED = {"SACAux": "sac_aux", "no loss": "no_loss", "SAC": "sac", "CrossQ": "crossq", "TQC": "tqc"}
+PROVED = {"SACAux": "sac_aux", "`n_steps=3`": "n_steps_3", "no loss": "n_steps_3_no_loss", "SAC": "sac", "CrossQ": "crossq"}
 # What a search does to losses; the others are drawn at random, from priors, or given.
 EVOLVED = ("crossover", "replacement", "horizon_change")
 DRAWN, BEST = 20, 10
@@ -101,7 +101,7 @@ def sentence(text: str, rows: Iterable[list[Any]]) -> str:
     """
     found = []
     for task, sac, _, _, drq in rows:
-        if last := last_returns(RESULTS / "agent/proof/runs/sac_aux" / task):
+        if last := last_returns(RESULTS / "agent/proof/runs/n_steps_3" / task):
             mean = statistics.mean(last)
             found.append((mean / drq, mean / float(sac.strip("_").partition(" ")[0].replace(",", ""))))
     share, times = map(statistics.median, zip(*found, strict=True))
