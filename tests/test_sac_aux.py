@@ -142,8 +142,8 @@ def sac_and_ours(policy: str, env: Callable[[], Any], steps: int, ours: dict[str
     sac = SAC(policy, env(), **both).learn(steps)
     sacs = {"critic_norm": None, "optimizer_kwargs": {"betas": (0.9, 0.999)}}
     ours = {**both, **ours, "policy_kwargs": {**sacs, **both["policy_kwargs"], **ours["policy_kwargs"]}}
-    ours = {"target_entropy": "auto", **ours}
-    return sac, SACAux(policy, env(), **{"aux_loss": None, "policy_delay": 1, **ours}).learn(steps)
+    ours = {"aux_loss": None, "policy_delay": 1, "target_entropy": "auto", **ours}
+    return sac, SACAux(policy, env(), **ours).learn(steps)
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,7 @@ def main() -> None:
     env, repeat = make(args.task)
     file = args.out / f"{args.variant}_{args.task}_{args.seed}.jsonl"
     file.unlink(missing_ok=True)
-    settings = {"learning_starts": 5000, "buffer_size": 200_000, **VARIANTS[args.variant]}
+    settings = {"n_steps": 3, "learning_starts": 5000, "buffer_size": 200_000, **VARIANTS[args.variant]}
     model = SACAux("MlpPolicy", env, seed=args.seed, device="cpu", **settings)
     model.learn(args.steps // repeat, callback=Probe(args.task, args.every // repeat, args.episodes, file), log_interval=10**9)
 

@@ -53,7 +53,8 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(1)
     env_id = resolve_env_id(args.env)
-    values = {**load_hyperparameters(find_file(Path("sac_aux")), env_id), "learning_starts": args.learning_starts}
+    values = load_hyperparameters(find_file(Path("sac_aux")), env_id)
+    values |= {"n_steps": 3, "learning_starts": args.learning_starts}
     values.pop("policy", None)
     checkpoints = tuple(range(args.every, args.steps + 1, args.every))
     run = Run(environment=env_id, aux_loss="auto", hyperparameters=values, seed=args.seed, checkpoints=checkpoints)

@@ -55,7 +55,7 @@ def main(variant: str, seed: int) -> None:
     if variant == "sac":
         model: SAC = SAC("MlpPolicy", env, **kwargs)
     else:
-        model = SACAux("MlpPolicy", env, **kwargs | SETTINGS.get(variant, {}))
+        model = SACAux("MlpPolicy", env, **kwargs | {"n_steps": 3} | SETTINGS.get(variant, {}))
     for critic in (model.critic, model.critic_target) if variant in CHANGES else ():
         for network in critic.q_networks:
             CHANGES[variant](network)

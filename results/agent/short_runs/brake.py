@@ -19,7 +19,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_aarl import SACAux
 
 STEPS, EVERY = 3000, 500
-VARIANTS: dict[str, dict[str, Any]] = {  # of the defaults before ../targets: no target Q networks
+VARIANTS: dict[str, dict[str, Any]] = {  # of the defaults before ../targets
     "ours": {"tau": 1},
     "nonorm": {"tau": 0.005, "policy_kwargs": {"critic_norm": None}},
     "n1": {"tau": 1, "n_steps": 1},
@@ -36,7 +36,8 @@ def main(name: str, seed: int) -> None:
     if name == "sac":
         model: SAC = SAC("MlpPolicy", "Brake-v0", seed=seed, device="cpu")
     else:
-        model = SACAux("MlpPolicy", "Brake-v0", seed=seed, device="cpu", learning_starts=300, **VARIANTS[name])
+        settings = {"learning_starts": 300, "n_steps": 3, **VARIANTS[name]}
+        model = SACAux("MlpPolicy", "Brake-v0", seed=seed, device="cpu", **settings)
     for module in model.critic.modules() if name == "momentum" else ():
         if isinstance(module, th.nn.BatchNorm1d):
             module.momentum = 0.1
