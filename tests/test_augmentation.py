@@ -63,16 +63,6 @@ def test_random_crop_is_uniform_over_all_positions_and_independent_over_images()
     assert alike == pytest.approx(1 / 12, abs=0.02)
 
 
-def test_seeds_repeat_a_crop_and_a_shift() -> None:
-    images = pictures(9, 3, 12, 12)
-    for augment in (lambda: random_crop(images, 8), lambda: random_shift(images, 3)):
-        results = []
-        for seed in (3, 3, 4):
-            th.manual_seed(seed)
-            results.append(augment())
-        assert th.equal(results[0], results[1]) and not th.equal(results[0], results[2])
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("height, width, pad", [(7, 7, 2), (5, 8, 3), (6, 6, 0)])
 def test_random_shift_cuts_the_padded_picture(height: int, width: int, pad: int, dtype: th.dtype) -> None:

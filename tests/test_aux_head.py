@@ -79,10 +79,6 @@ def oracle(head: AuxHead, windows: WindowSamples, encoder: Encoder, target_encod
     target = embed(windows, head.loss.target, target_encoder).detach()
     first, *_, last = head.predictor
     hidden = source @ first.weight.T + first.bias
-    if len(head.predictor) == 4:
-        norm = head.predictor[1]
-        hidden = (hidden - hidden.mean(dim=0)) / (hidden.var(dim=0, unbiased=False) + norm.eps).sqrt()
-        hidden = hidden * norm.weight + norm.bias
     return head.operator(hidden.clamp(min=0) @ last.weight.T + last.bias, target)
 
 

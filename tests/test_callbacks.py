@@ -13,7 +13,6 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_aarl import SACAux
@@ -90,15 +89,6 @@ def test_seconds_continue_with_training(monkeypatch: pytest.MonkeyPatch) -> None
     next(clock)  # between calls of learn() it does not count
     model.learn(10, callback, reset_num_timesteps=False)
     assert [point.seconds for point in callback.curve] == [10.0, 20.0]
-
-
-def test_each_evaluation_is_logged(tmp_path: Path) -> None:
-    model = make_model(Walk())
-    model.set_logger(configure(str(tmp_path), ["csv"]))
-    model.learn(20, LearningCurveCallback(Walk(), [10, 20], 1))
-    with (tmp_path / "progress.csv").open() as file:
-        steps = [row["eval/environment_steps"] for row in csv.DictReader(file)]
-    assert [step for step in steps if step] == ["10", "20"]
 
 
 def play(model: SACAux, env: gym.Env, seed: int) -> tuple[float, int]:

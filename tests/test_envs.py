@@ -97,20 +97,6 @@ def test_sb3_takes_it(kwargs: dict[str, Any]) -> None:
         check_env(make_dmc_env("cheetah-run", **kwargs))
 
 
-def test_a_frame_stack_has_the_newest_last_and_begins_with_the_first_one() -> None:
-    single = make_dmc_env("walker-walk", action_repeat=2)
-    stacked = make_dmc_env("walker-walk", action_repeat=2, frame_stack=3)
-    frames = [single.reset(seed=4)[0]]
-    observations = [stacked.reset(seed=4)[0]]
-    for value in (0.1, -0.5, 0.9):
-        action = np.full(single.action_space.shape, value)
-        frames.append(single.step(action)[0])
-        observations.append(stacked.step(action)[0])
-    for i, observation in enumerate(observations):
-        expected = [frames[max(0, i - back)] for back in (2, 1, 0)]
-        np.testing.assert_array_equal(observation, np.concatenate(expected))
-
-
 def test_pictures_are_the_suites_own_channels_first_and_stacked() -> None:
     env = make_dmc_env("cheetah-run", **{**SMALL, "image_size": (24, 32)})
     assert env.observation_space == spaces.Box(0, 255, (9, 24, 32), np.uint8)

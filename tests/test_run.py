@@ -340,7 +340,13 @@ def test_tensorboard_has_every_evaluation_of_a_short_run(tmp_path: Path) -> None
     assert [(event.step, event.value) for event in events.Scalars("eval/mean_reward")] == [
         (point.environment_steps, pytest.approx(point.mean)) for point in curve
     ]
-    for name in ("rollout/ep_rew_mean", "rollout/ep_len_mean", "train/critic_loss", "train/aux_loss"):
+    for name in (
+        "rollout/ep_rew_mean",
+        "rollout/ep_len_mean",
+        "eval/environment_steps",
+        "train/critic_loss",
+        "train/aux_loss",
+    ):
         assert events.Scalars(name)[-1].step == 48
 
 

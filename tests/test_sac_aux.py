@@ -817,15 +817,6 @@ def test_bad_arguments(kind: str, settings: dict[str, Any], message: str) -> Non
         make_model(kind, **settings)
 
 
-def test_the_frame_stack_is_detected(tmp_path: pathlib.Path) -> None:
-    stacked = make_model(env=VecFrameStack(make_env("state"), 2)).learn(30)
-    assert stacked.replay_buffer.stores[""].stack == 2
-    stacked.save(tmp_path / "model")
-    assert SACAux.load(tmp_path / "model").replay_buffer.stores[""].stack == 2  # without wrappers to look at
-    with pytest.raises(ValueError, match=r"frame_stack=3 does not fit observations of shape \(3, 18, 20\)"):
-        make_model("pixels", replay_buffer_kwargs={"frame_stack": 3}).learn(20)
-
-
 @pytest.mark.parametrize(
     ("shape", "advice"),
     [((84, 84), "add a channel"), ((4, 40, 40, 3), "SB3's VecFrameStack"), ((4, 40, 40, 1), "without a channel")],
