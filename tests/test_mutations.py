@@ -4,12 +4,10 @@ from collections import Counter
 from itertools import product
 
 import numpy as np
-import optuna
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
-from sb3_aarl.search.evolution.mutations import crossover, horizon_change, other_parameter, replacement
+from sb3_aarl.search.evolution.mutations import crossover, horizon_change, replacement
 from sb3_aarl.search.evolution.space import random_loss
 from scipy.stats import binomtest, chisquare
 from test_space import losses
@@ -128,34 +126,3 @@ def test_a_searched_operator_changes_as_often_as_a_bit() -> None:
     others = Counter(child.operator for child in children if child.operator != "mse")
     assert len(others) == 4
     assert chisquare(list(others.values())).pvalue > 0.001
-
-
-@pytest.mark.parametrize(
-    ("distribution", "value", "near"),
-    [
-        (CategoricalDistribution(["relu", "elu", "tanh"]), "elu", None),
-        (IntDistribution(1, 5), 3, (2, 4)),
-        (IntDistribution(16, 1024, log=True), 128, (50, 300)),
-        (IntDistribution(0, 100, step=25), 50, (25, 75)),
-        (FloatDistribution(1e-5, 1e-2, log=True), 1e-3, (2e-4, 5e-3)),
-        (FloatDistribution(0, 1, step=0.25), 1.0, (0.5, 1)),
-        (FloatDistribution(-1, 1), -1, (-1, -0.4)),
-    ],
-)
-def test_other_parameters_keep_their_value_half_of_the_time_and_stay_near_it(
-    distribution: BaseDistribution, value: float | str, near: tuple[float, float] | None
-) -> None:
-    rng = np.random.default_rng(0)
-    values = [other_parameter(value, distribution, rng) for _ in range(1000)]
-    for other in values:
-        optuna.create_trial(params={"x": other}, distributions={"x": distribution}, value=0.0)  # raises for what is outside
-    kept = sum(other == value for other in values) / 1000
-    assert 0.45 < kept < 0.85 and len(set(values)) >= 3
-    if near is not None:
-        assert np.mean([near[0] <= other <= near[1] for other in values]) > 0.75
-
-
-def test_the_ends_of_a_grid_are_drawn() -> None:
-    rng = np.random.default_rng(0)
-    distribution = FloatDistribution(0, 0.3, step=0.1)
-    assert {other_parameter(0.2, distribution, rng) for _ in range(500)} == {0.0, 0.1, 0.2, 0.3}

@@ -166,8 +166,6 @@ def benchmark(
     checkpoints: Annotated[
         str | None,
         typer.Option(
-            "--checkpoints",
-            "--steps",
             help="Environment steps to compare at; the last ends the run.",
             show_default="100k,500k,1000k as far as the files' n_timesteps",
         ),

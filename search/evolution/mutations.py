@@ -1,10 +1,8 @@
-"""The paper's mutations of a loss (section 2.2, figure 3, A.3), and of other parameters. A ValueError means: draw again."""
+"""The paper's mutations of a loss (section 2.2, figure 3, A.3). A ValueError means: draw again."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from sb3_aarl.search.evolution.space import MAX_HORIZON, random_operator
 
 from sb3_aarl.aux_loss import AuxLoss
@@ -48,27 +46,3 @@ def horizon_change(loss: AuxLoss, rng: np.random.Generator, max_horizon: int = M
         added = (rng.random((2, 3)) < 0.5).tolist()
         source, target = loss.source + tuple(added[0]), loss.target + tuple(added[1])
     return AuxLoss(loss.horizon + change, source, target, loss.operator, loss.negatives)
-
-
-def other_parameter(value: Any, distribution: BaseDistribution, rng: np.random.Generator) -> Any:
-    """
-    Keep the parent's value of a parameter with probability 0.5. Else draw one of the categories, or a number near the
-    parent's: normal, with a fifth of the range (of its logarithm, if the distribution is ``log``) as deviation.
-    """
-    if rng.random() < 0.5:
-        return value
-    if isinstance(distribution, CategoricalDistribution):
-        return distribution.choices[rng.integers(len(distribution.choices))]
-    assert isinstance(distribution, IntDistribution | FloatDistribution)
-    half = 0.5 * (distribution.step or 0)  # as if every number of a grid stood for its surroundings
-    scale, unscale = (np.log, np.exp) if distribution.log else (float, float)
-    low, high = scale(distribution.low - half), scale(distribution.high + half)
-    while True:
-        number = float(unscale(rng.normal(scale(value), 0.2 * (high - low))))
-        if distribution.step is not None:
-            steps = round((number - distribution.low) / distribution.step)
-            number = distribution.low + distribution.step * steps
-            if steps == round((distribution.high - distribution.low) / distribution.step):
-                number = distribution.high  # 0.3, where the sum is 0.30000000000000004
-        if distribution.low <= number <= distribution.high:
-            return int(number) if isinstance(distribution, IntDistribution) else number

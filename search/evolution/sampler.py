@@ -15,7 +15,7 @@ from optuna.distributions import BaseDistribution
 from optuna.samplers import BaseSampler, RandomSampler
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
-from sb3_aarl.search.evolution import mutations, space
+from sb3_aarl.search.evolution import space
 from sb3_aarl.search.evolution.candidates import Candidates, Result, Settings
 from sb3_aarl.search.evolution.space import SEED_INDEX_KEY, SLOT_KEY
 
@@ -57,7 +57,7 @@ class AuxLossSampler(Settings, BaseSampler):
     parameters of a loss take a random slot if there is one.
 
     Trials that are pruned, have no finite score or violate a constraint (``trial.set_constraint``) are parents only if there
-    are no others. What is searched beside the loss is inherited from a parent and, every other time, changed. Other samplers
+    are no others. What is searched beside the loss is inherited from a parent or, every other time, drawn anew. Other samplers
     may hold this one (``PartialFixedSampler``, ``independent_sampler``): the loss of a trial is the one of its parameters.
 
     Asking never waits. A trial that finds no free slot gets an extra one, as the next generation would have it, so that
@@ -191,8 +191,8 @@ class AuxLossSampler(Settings, BaseSampler):
             return inherited[0]
         if self.independent_sampler is not None:
             return self.independent_sampler.sample_independent(study, trial, param_name, param_distribution)
-        if inherited:
-            return mutations.other_parameter(inherited[rng.integers(len(inherited))], param_distribution, rng)
+        if inherited and rng.random() < 0.5:
+            return inherited[rng.integers(len(inherited))]
         return RandomSampler(int(rng.integers(2**32))).sample_independent(study, trial, param_name, param_distribution)
 
     def _planned(self, assigned: dict[str, Any]) -> dict[str, Any]:

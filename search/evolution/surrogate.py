@@ -11,8 +11,6 @@ from sb3_aarl.aux_loss import OPERATORS, AuxLoss
 
 # Of a score: such as -sys.float_info.max, which stands for a failure.
 LARGEST = 1e100
-# Losses that the model is fitted to, the last ones: its cost grows with their number to the third power.
-MOST_LOSSES = 1000
 # What is fitted is one of these: the distance over which losses are alike, and the parts of the variance of scores that come
 # from tokens, from a loss alone, and from one run.
 LENGTHS = (4.0, 8.0, 16.0)
@@ -54,8 +52,6 @@ class TokenModel:
         for loss, score in zip(losses, scores, strict=True):
             if abs(score) < LARGEST:
                 self.scores.setdefault(loss.canonical(), []).append(score)
-        for form in list(self.scores)[:-MOST_LOSSES]:
-            del self.scores[form]
         if self.scores:
             self._fit()
 

@@ -15,7 +15,7 @@ from sb3_aarl.search.evolution.racing import next_runs, standings
 from sb3_aarl.search.evolution.surrogate import TokenModel
 from sb3_aarl.search.execution.matrix import Cell, Matrix, scores
 from sb3_aarl.search.results.analysis import analysed, ranked, trial_table
-from sb3_aarl.search.studies.config import Baseline, CrossValidation, SearchConfig, merge_space
+from sb3_aarl.search.studies.config import Baseline, SearchConfig, merge_space
 from sb3_aarl.search.studies.search import check_study, search_matrix, stored_settings
 from sb3_aarl.search.training.config import ConfigError
 
@@ -58,14 +58,29 @@ def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselin
 
     :raises ValueError: when the configuration is not that of the study
     """
-    section = _section(config)
+    section = config.cross_validation
+    if section is None:
+        raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
     check_study(study, config, free=("threads",))
     if {*config.seeds} & {*section.seeds} and {*config.tasks} & {*(section.environments or config.tasks)}:
         logger.warning("cross_validation.seeds has seeds of the search: scores that candidates were chosen for count again")
     losses, values = top_losses(study, section.top, section.top_rated), searched_values(config, study)
     candidates = [Baseline(name=str(loss), aux_loss=loss, overrides=merge_space({}, values[loss])) for loss in losses]
+    # Those that race may have more seeds.
     n_more = section.budget - len(section.seeds) if section.budget else 0
-    return _make_matrix(config, folder, [*candidates, *baselines], candidates, n_more)
+    more = range(max(section.seeds) + 1, max(section.seeds) + 1 + n_more)
+    variants = [*candidates, *baselines]
+    cells = [
+        Cell(variant.name, environment, seed)
+        for seed, some in (dict.fromkeys(section.seeds, variants) | dict.fromkeys(more, candidates)).items()
+        for environment, variant in product(section.environments or config.tasks, some)
+    ]
+    by_name = {variant.name: variant for variant in variants}
+    matrix = search_matrix(config, f"{config.name}-cross-validation", folder / "cross-validation", cells, by_name)
+    # On the search's environments, runs may be longer than those of its candidates.
+    checkpoints = {environment: {"checkpoints": steps} for environment, steps in section.checkpoints.items()}
+    runs = {cell: run.model_copy(update=checkpoints.get(cell.environment)) for cell, run in matrix.runs.items()}
+    return replace(matrix, runs=runs)
 
 
 def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
@@ -73,7 +88,8 @@ def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
     The parts of a matrix, each of which must be trained before the next one is asked for: all of it or, with a budget, the
     rounds of a race, which a loss leaves when a run of it fails.
     """
-    section, baselines = _section(config), {baseline.name for baseline in config.baselines}
+    section, baselines = config.cross_validation, {baseline.name for baseline in config.baselines}
+    assert section is not None
     if section.budget is None:
         yield matrix
         return
@@ -94,33 +110,6 @@ def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
         waiting.clear()
         trained = scores(part).dropna(subset="score")  # of a finished run too, a score may be NaN
         failed |= {cell.variant for cell in {*cells}.difference(trained.iloc[:, :3].itertuples(index=False))} - baselines
-
-
-def _section(config: SearchConfig) -> CrossValidation:
-    if config.cross_validation is None:
-        raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
-    return config.cross_validation
-
-
-def _make_matrix(
-    config: SearchConfig, folder: Path, variants: Sequence[Baseline], racing: Sequence[Baseline], n_more: int
-) -> Matrix:
-    """All variants with the seeds of the section, and those that race with so many more seeds."""
-    section = _section(config)
-    more = range(max(section.seeds) + 1, max(section.seeds) + 1 + n_more)
-    by_name = {variant.name: variant for variant in variants}
-    of_seeds = dict.fromkeys(section.seeds, variants) | dict.fromkeys(more, racing)
-    environments = section.environments or tuple(config.tasks)
-    cells = [
-        Cell(variant.name, environment, seed)
-        for seed, some in of_seeds.items()
-        for environment, variant in product(environments, some)
-    ]
-    matrix = search_matrix(config, f"{config.name}-cross-validation", folder / "cross-validation", cells, by_name)
-    # On the search's environments, runs may be longer than those of its candidates.
-    checkpoints = {environment: {"checkpoints": steps} for environment, steps in section.checkpoints.items()}
-    runs = {cell: run.model_copy(update=checkpoints.get(cell.environment)) for cell, run in matrix.runs.items()}
-    return replace(matrix, runs=runs)
 
 
 def seed_scores(runs: pd.DataFrame, n_environments: int) -> pd.DataFrame:
