@@ -32,7 +32,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_aarl import SACAux
-from sb3_aarl.callbacks import LearningCurveCallback, SingleEpisodes
+from sb3_aarl.callbacks import LearningCurveCallback
 from sb3_aarl.envs import make_dmc_env
 
 ACTION_REPEAT = 4
@@ -123,7 +123,7 @@ def evaluation(callback: LearningCurveCallback) -> float:
 def measure_evaluation(
     task: str, pixels: bool, ways: list[tuple[str, int]], rounds: int, pixel_steps: int
 ) -> list[dict[str, Any]]:
-    settings: dict[str, Any] = {"wrapper_class": SingleEpisodes, **({"agent_steps": pixel_steps} if pixels else {})}
+    settings: dict[str, Any] = {"agent_steps": pixel_steps} if pixels else {}
     model = SACAux("CnnPolicy" if pixels else "MlpPolicy", make(task, pixels, "dummy", 1), buffer_size=100, seed=0)
     variants: dict[str, Callable[[], float]] = {}
     envs = []

@@ -9,13 +9,6 @@ AUGMENTATIONS = ("auto", "random_crop", "random_shift", "none")
 CROP_SIZE = 84  # paper, table 7
 
 
-def _check_crop(images: th.Tensor, size: int) -> None:
-    if images.ndim != 4 or min(images.shape[2:]) < size:
-        raise ValueError(
-            f"cannot crop images of shape {tuple(images.shape)} (batch, channels, height, width) to {size} x {size}"
-        )
-
-
 def cut(images: th.Tensor, numbers: th.Tensor, top: th.Tensor, left: th.Tensor, height: int, width: int) -> th.Tensor:
     """
     Parts of images, (..., channels, height, width), without a copy of the images that they are cut from.
@@ -39,9 +32,7 @@ def random_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
 
     :param images: (batch, channels, height, width), any dtype
     :param size: Height and width in pixels of what is kept
-    :raises ValueError: when the images are smaller
     """
-    _check_crop(images, size)
     batch, _, height, width = images.shape
     if height == width == size:
         return images
@@ -70,9 +61,7 @@ def center_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
 
     :param images: (batch, channels, height, width), any dtype
     :param size: Height and width in pixels of what is kept
-    :raises ValueError: when the images are smaller
     """
-    _check_crop(images, size)
     top, left = ((length - size) // 2 for length in images.shape[2:])
     return images[:, :, top : top + size, left : left + size]
 
@@ -99,20 +88,24 @@ def cropped_space(space: spaces.Space, size: int, normalized_image: bool) -> spa
     return cropped.get("", space)
 
 
-def resolve_augmentation(augmentation: str, space: spaces.Space, crop_size: int | None, normalized_image: bool) -> str:
-    """What ``augmentation`` means for these observations: ``random_crop``, ``random_shift`` or ``none``."""
+def resolve_augmentation(
+    augmentation: str, space: spaces.Space, crop_size: int | None, normalized_image: bool
+) -> tuple[str, int | None]:
+    """What ``augmentation`` means for these observations: ``random_crop`` and its size, ``random_shift`` or ``none``."""
     if augmentation not in AUGMENTATIONS:
         raise ValueError(f"unknown augmentation {augmentation!r}, expected one of {', '.join(AUGMENTATIONS)}")
     sizes = {key: box.shape[1:] for key, box in image_spaces(space, normalized_image).items()}
     if not sizes:
-        return "none"
+        return "none", None
     if augmentation == "auto":
         augmentation = "random_shift" if crop_size is None else "random_crop"
+    if augmentation != "random_crop":
+        return augmentation, None
     crop_size = CROP_SIZE if crop_size is None else crop_size
     for key, size in sizes.items():
-        if augmentation == "random_crop" and min(size) < crop_size:
+        if min(size) < crop_size:
             raise ValueError(
                 f"images{f' under {key!r}' if key else ''} of {size[0]} x {size[1]} pixels are smaller than the crop of "
                 f"{crop_size} x {crop_size}: render them larger, or pass augmentation='random_shift'"
             )
-    return augmentation
+    return augmentation, crop_size

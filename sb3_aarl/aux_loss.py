@@ -94,15 +94,7 @@ class AuxLoss:
         negatives: bool = False,
         horizon: int | None = None,
     ) -> "AuxLoss":
-        """
-        The loss that predicts the tokens ``target`` from the tokens ``source``.
-
-        :param source: Tokens of the source
-        :param target: Tokens of the target
-        :param operator: As in the class
-        :param negatives: As in the class
-        :param horizon: None for the smallest that holds all tokens
-        """
+        """The loss that predicts the tokens ``target`` from the tokens ``source``, with the smallest horizon if it is None."""
         source, target = set(source), set(target)
         longest = max(source | target, key=lambda token: token.horizon, default=Token("s", 0))
         horizon = _checked_horizon(longest.horizon if horizon is None else horizon)
@@ -119,9 +111,7 @@ class AuxLoss:
         What differs from the defaults may follow in brackets, as ``str(loss)`` writes it:
         ``{s_t} -> {s_t} [bilinear, negatives, horizon=2]``.
 
-        :param text: The notation
-        :param operator: As in the class; brackets in the text win over the default
-        :param negatives: As in the class; brackets in the text win over the default
+        :param text: The notation; brackets in it win over the other arguments' defaults
         :param horizon: None for the smallest that holds all tokens
         :raises ValueError: naming what cannot be read, or the rule that the loss breaks
         """
@@ -183,11 +173,7 @@ class AuxLoss:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "AuxLoss":
-        """
-        The loss of :meth:`to_dict`; all but ``loss`` may be left out.
-
-        :param values: Mapping with the keys ``loss`` (notation), ``operator``, ``negatives``, ``horizon``
-        """
+        """The loss of :meth:`to_dict`; all but ``loss`` (the notation) may be left out."""
         unknown = set(values) - {"loss", "operator", "negatives", "horizon"}
         if unknown or not isinstance(values.get("loss"), str):
             problem = f"unknown key {min(map(str, unknown))!r}" if unknown else "no notation under 'loss'"

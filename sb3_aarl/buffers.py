@@ -68,15 +68,12 @@ class WindowReplayBuffer(ReplayBuffer):
     do not follow the last next observation, without an end of the episode in between (a reset by hand, a new env), begin a
     new episode; the transition before them counts as truncated.
 
+    Other arguments are those of SB3's buffers.
+
     :param buffer_size: Max number of transitions, all envs together
     :param observation_space: Observation space, Dict or not
-    :param action_space: Action space
-    :param device: PyTorch device of what is sampled
-    :param n_envs: Number of parallel environments
     :param optimize_memory_usage: Accepted for SB3; frames are stored once anyway
-    :param handle_timeout_termination: Whether to bootstrap where an episode was truncated
-    :param n_steps: Number of steps of n-step returns in ``sample``
-    :param gamma: Discount of n-step returns
+    :param n_steps: Number of steps of n-step returns in ``sample``, discounted by ``gamma``
     :param frame_stack: How many frames the environment stacks along the first axis of an observation, oldest first
         (channels of images, which SB3 puts first); one number, or one for each key of a Dict. At an episode's start
         the first frame may be repeated (Gymnasium's FrameStackObservation) or zeros may fill up (SB3's VecFrameStack)

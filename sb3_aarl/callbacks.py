@@ -5,7 +5,7 @@ import io
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -37,42 +37,8 @@ class Evaluation(NamedTuple):
 
 
 def aulc(curve: Sequence[Evaluation]) -> float:
-    """
-    Area under the learning curve as the paper approximates it (figure 4): the mean return over all evaluations.
-
-    :param curve: Evaluations at equally spaced steps
-    """
+    """Area under a learning curve as the paper approximates it (figure 4): the mean of equally spaced evaluations."""
     return float(np.mean([evaluation.mean for evaluation in curve]))
-
-
-class SingleEpisodes(gym.Wrapper):
-    """
-    One episode for each ``reset(seed=...)``, and nothing is simulated after it: for ``LearningCurveCallback``.
-
-    SB3's vectorized environments reset an environment as soon as its episode ends, and step it until all others have ended
-    theirs. Here that costs nothing: until the next seed, the environment stays at its last observation.
-
-    :param env: The environment, ``Monitor`` included
-    """
-
-    def __init__(self, env: gym.Env):
-        super().__init__(env)
-        self._over = False
-        self._observation: Any = None
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        if self._over and seed is None:
-            return self._observation, {}
-        self._over = False
-        self._observation, info = self.env.reset(seed=seed, options=options)
-        return self._observation, info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        if self._over:
-            return self._observation, 0.0, False, False, {}
-        self._observation, reward, terminated, truncated, info = self.env.step(action)
-        self._over = terminated or truncated
-        return self._observation, reward, terminated, truncated, info
 
 
 class LearningCurveCallback(BaseCallback):
@@ -85,7 +51,7 @@ class LearningCurveCallback(BaseCallback):
     amplify them: compare runs that are evaluated with equally many. The last checkpoint may be the end of training.
 
     :param eval_env: Environment to evaluate on, not the one that is trained on. A VecEnv, such as
-        ``make_vec_env(make_dmc_env, 10, wrapper_class=SingleEpisodes, env_kwargs=...)``, has at most ``n_eval_episodes``
+        ``make_vec_env(make_dmc_env, 10, env_kwargs=...)``, has at most ``n_eval_episodes``
     :param checkpoints: Environment steps (agent steps x action repeat) at which to evaluate, ascending
     :param n_eval_episodes: Episodes of each evaluation
     :param action_repeat: Environment steps of one agent step, None for that of the environment's wrappers
@@ -111,7 +77,7 @@ class LearningCurveCallback(BaseCallback):
     ):
         super().__init__(verbose)
         if not isinstance(eval_env, VecEnv):
-            env = SingleEpisodes(eval_env if is_wrapped(eval_env, Monitor) else Monitor(eval_env))
+            env = eval_env if is_wrapped(eval_env, Monitor) else Monitor(eval_env)
             eval_env = DummyVecEnv([lambda: env])
         self.eval_env = eval_env
         if action_repeat is None:
@@ -184,12 +150,7 @@ class LearningCurveCallback(BaseCallback):
 
 
 def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:
-    """
-    Write a learning curve as CSV, one evaluation a line; an old file is replaced in one step.
-
-    :param path: The file; its folder is made if it is not there
-    :param curve: The evaluations
-    """
+    """Write a learning curve as CSV, one evaluation a line; an old file is replaced in one step."""
     file = io.StringIO(newline="")
     writer = csv.writer(file)
     writer.writerow(Evaluation._fields)
@@ -198,12 +159,7 @@ def write_curve(path: Path, curve: Sequence[Evaluation]) -> None:
 
 
 def read_curve(path: str | Path) -> list[Evaluation]:
-    """
-    Read what :func:`write_curve` wrote.
-
-    :param path: The file
-    :raises ValueError: naming the line that is no evaluation
-    """
+    """Read what :func:`write_curve` wrote; a ValueError names the line that is no evaluation."""
     with Path(path).open(newline="", encoding="utf-8") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     if tuple(header) != Evaluation._fields:

@@ -40,24 +40,10 @@ class Encoder(BaseFeaturesExtractor, ABC):
 
     @abstractmethod
     def trunk(self, observations: th.Tensor) -> th.Tensor:
-        """
-        All but the projection.
-
-        :param observations: (batch, ...) floats as SB3 preprocesses them
-        :return: (batch, trunk_dim)
-        """
-
-    def project(self, trunk: th.Tensor) -> th.Tensor:
-        """
-        The rest.
-
-        :param trunk: Output of ``trunk``
-        :return: Latent states (batch, features_dim)
-        """
-        return self.projection(trunk)
+        """All but the projection: (batch, trunk_dim) of observations (batch, ...), floats as SB3 preprocesses them."""
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.project(self.trunk(observations))
+        return self.projection(self.trunk(observations))
 
 
 class PixelEncoder(Encoder):
@@ -138,8 +124,6 @@ class RunningNorm(nn.Module):
     Observations with mean 0 and variance 1, by the running statistics of the batches that losses are computed on.
 
     Predictions and the actor, which read the encoder without gradients, leave the statistics as they are.
-
-    :param size: Dimension of a flat observation
     """
 
     running_mean: th.Tensor
@@ -171,24 +155,22 @@ class RunningNorm(nn.Module):
 
 class SimbaEncoder(Encoder):
     """
-    Encoder in the manner of SimBa (Lee et al., 2024): running normalisation, a linear layer, residual blocks, layer norm.
+    Encoder in the manner of SimBa (Lee et al., 2024): running normalisation, a linear layer, a residual block, layer norm.
 
     All of it is the trunk, and the latent state is the trunk's output. The actor reads it as it is if it contains the
     observation, else through a projection of its own.
 
     :param observation_space: Any space that SB3 can flatten
-    :param features_dim: Width of all blocks, and of the latent state without the observation; 128 was slower
+    :param features_dim: Width of the block, and of the latent state without the observation; 128 was slower
         (results/agent/encoder_width)
-    :param n_blocks: Number of residual blocks
     :param normalize: Whether observations are normalised; VecNormalize would do the same before
-    :param observation: Whether the latent state contains the (normalised) observation beside the output of the blocks
+    :param observation: Whether the latent state contains the (normalised) observation beside the output of the block
     """
 
     def __init__(
         self,
         observation_space: spaces.Space,
         features_dim: int = 64,
-        n_blocks: int = 1,
         normalize: bool = True,
         observation: bool = True,
     ):
@@ -197,9 +179,8 @@ class SimbaEncoder(Encoder):
         super().__init__(observation_space, latent_dim, trunk_dim=latent_dim)
         self.observation = observation
         self.normalization: nn.Module = RunningNorm(inputs) if normalize else nn.Identity()
-        blocks = [SimbaBlock(features_dim) for _ in range(n_blocks)]
-        self.layers = nn.Sequential(nn.Linear(inputs, features_dim), *blocks, nn.LayerNorm(features_dim))
-        self.layers.apply(orthogonal_init)
+        layers = nn.Linear(inputs, features_dim), SimbaBlock(features_dim), nn.LayerNorm(features_dim)
+        self.layers = nn.Sequential(*layers).apply(orthogonal_init)
         self.projection = nn.Identity()
 
     def make_projection(self) -> nn.Module:
@@ -219,12 +200,7 @@ VECTOR_ENCODERS: Mapping[str, type[DenseMLP] | type[SimbaEncoder]] = {
 
 
 class SideBySide(nn.Module):
-    """
-    Modules that each read a part of the input, their outputs side by side.
-
-    :param modules: One for each part
-    :param widths: Widths of the parts
-    """
+    """Modules that each read a part of the input, of so many columns, and their outputs side by side."""
 
     def __init__(self, modules: Sequence[nn.Module], widths: Sequence[int]):
         super().__init__()
@@ -296,12 +272,7 @@ ENCODERS: Mapping[str, type[BaseFeaturesExtractor]] = {
 
 
 def encoder_class(name_or_class: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
-    """
-    The features extractor of a name in plain YAML, or a class as it is.
-
-    :param name_or_class: One of ``ENCODERS``, or a class
-    :raises ValueError: for an unknown name
-    """
+    """The features extractor of a name of ``ENCODERS``, or a class as it is."""
     if not isinstance(name_or_class, str):
         return name_or_class
     if name_or_class not in ENCODERS:

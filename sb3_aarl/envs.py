@@ -74,6 +74,12 @@ def env_ids() -> list[str]:
     return sorted(f"{PREFIX}{domain}-{task}-v0" for domain, task in suite.ALL_TASKS)
 
 
+def find_task(name: str) -> str | None:
+    """The id of a task by it or by its short form, such as ``Cheetah-Run`` or ``humanoid_CMU-run``; None if there is none."""
+    by_name = {env_id.lower(): env_id for env_id in env_ids()}
+    return by_name.get(f"{PREFIX}{name.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0")
+
+
 def make_dmc_env(
     env_id: str,
     *,
@@ -104,15 +110,13 @@ def make_dmc_env(
     :raises ValueError: for an unknown task, with the nearest ones
     :raises ImportError: without the extra ``dmc``
     """
-    known = env_ids()
+    known, task = env_ids(), find_task(env_id)
     if not known:
         raise ImportError(NEEDS_DMC)
-    if env_id not in known:
-        full = f"{PREFIX}{env_id.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
-        if full not in known:
-            nearest = ", ".join(difflib.get_close_matches(full, known, cutoff=0.4)) or f"something like {known[0]}"
-            raise ValueError(f"unknown DeepMind Control task {env_id!r}, nearest: {nearest}")
-        env_id = full
+    if task is None:
+        nearest = ", ".join(difflib.get_close_matches(env_id, known, cutoff=0.4)) or f"something like {known[0]}"
+        raise ValueError(f"unknown DeepMind Control task {env_id!r}, nearest: {nearest}")
+    env_id = task
     domain = env_id.removeprefix(PREFIX).partition("-")[0]
     height, width = image_size if isinstance(image_size, Sequence) else (image_size, image_size)
     camera_id = CAMERAS.get(domain, 0) if camera_id is None else camera_id

@@ -36,12 +36,7 @@ _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """
-    Read the mapping in a YAML file. Nothing in it is evaluated.
-
-    :param path: The file
-    :raises ConfigError: naming the file, and the line if there is one
-    """
+    """Read the mapping in a YAML file. Nothing in it is evaluated; a ConfigError names the file and, if known, the line."""
     try:
         values = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
         json.dumps(values, default=str)  # refuses a mapping or list that contains itself
@@ -58,12 +53,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """
-    Write a file atomically, and create its folder. Other processes may read or write it at any time.
-
-    :param path: The file
-    :param text: All of its text
-    """
+    """Write a file atomically, and create its folder. Other processes may read or write it at any time."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path, path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")) as unfinished:
         unfinished.write_text(text, encoding="utf-8", newline="")
@@ -71,12 +61,7 @@ def replace_text(path: Path, text: str) -> None:
 
 @contextmanager
 def replacing(path: Path, unfinished: Path) -> Iterator[Path]:
-    """
-    Replace a file in one step by one that is written meanwhile.
-
-    :param path: The file
-    :param unfinished: Where it is written. Nothing is left there if that fails: a full disk has room for the reason again
-    """
+    """Replace a file in one step by ``unfinished``, of which nothing is left if that fails: a full disk has room again."""
     try:
         yield unfinished
         unfinished.replace(path)

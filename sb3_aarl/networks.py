@@ -19,8 +19,6 @@ def orthogonal_init(module: nn.Module) -> None:
     Orthogonal linear layers and delta-orthogonal convolutions, biases zero, as in CURL; for ``Module.apply``.
 
     Delta-orthogonal: all taps of a kernel are zero but the middle one, which is orthogonal across channels.
-
-    :param module: A layer; what is neither linear nor convolutional stays as it is
     """
     if isinstance(module, nn.Linear):
         nn.init.orthogonal_(module.weight)
@@ -34,11 +32,7 @@ def orthogonal_init(module: nn.Module) -> None:
 
 
 class SimbaBlock(nn.Module):
-    """
-    Residual block of SimBa (Lee et al., 2024): layer norm, a ReLU layer four times as wide, a projection back.
-
-    :param width: Width of input and output
-    """
+    """Residual block of SimBa (Lee et al., 2024): layer norm, a ReLU layer four times as wide, a projection back."""
 
     def __init__(self, width: int):
         super().__init__()

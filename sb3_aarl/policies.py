@@ -16,15 +16,7 @@ from stable_baselines3.sac.policies import Actor as SB3Actor
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
-from sb3_aarl.augmentation import (
-    CROP_SIZE,
-    center_crop,
-    cropped_space,
-    image_spaces,
-    random_crop,
-    random_shift,
-    resolve_augmentation,
-)
+from sb3_aarl.augmentation import center_crop, cropped_space, image_spaces, random_crop, random_shift, resolve_augmentation
 from sb3_aarl.encoders import Encoder, MultiInputEncoder, PixelEncoder, SimbaEncoder, encoder_class
 from sb3_aarl.networks import orthogonal_init, q_network
 
@@ -73,7 +65,7 @@ def map_images(obs: PyTorchObs, image_keys: Collection[str], function: Callable[
 def parts(encoder: BaseFeaturesExtractor) -> tuple[Callable[[Any], th.Tensor], Callable[[th.Tensor], th.Tensor]]:
     """An encoder's trunk, which actor and critic both read, and its projection; one without a projection is all trunk."""
     if isinstance(encoder, Encoder) and type(encoder).forward is Encoder.forward:
-        return encoder.trunk, encoder.project
+        return encoder.trunk, encoder.projection
     return encoder, nn.Identity()
 
 
@@ -106,8 +98,6 @@ class DetachedEncoder(BaseFeaturesExtractor):
 
     The projection (linear, layer norm) follows the encoder's trunk; an encoder that learns nothing, such as SB3's
     FlattenExtractor, is read as it is.
-
-    :param encoder: The critic's encoder
     """
 
     def __init__(self, encoder: BaseFeaturesExtractor):
@@ -130,27 +120,14 @@ class Actor(_CropsImages, SB3Actor):
     """
     SB3's actor, which also takes the trunk of the critic's encoder for observations.
 
-    :param crop_size: Height and width in pixels that images are cropped to, None for no crop
     :param squash_log_std: None for SB3's clipping of the log standard deviation to [-20, 2]; bounds such as (-10, 2)
         for tanh squashing into them
-    :param kwargs: Those of SB3's actor
+    :param kwargs: Those of SB3's actor, and ``crop_size``
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        crop_size: int | None = None,
-        squash_log_std: tuple[float, float] | None = None,
-        **kwargs: Any,
-    ):
-        super().__init__(*args, crop_size=crop_size, **kwargs)
+    def __init__(self, *args: Any, squash_log_std: tuple[float, float] | None = None, **kwargs: Any):
+        super().__init__(*args, **kwargs)
         self.squash_log_std = squash_log_std
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | {
-            "crop_size": self.crop_size,
-            "squash_log_std": self.squash_log_std,
-        }
 
     def own_parameters(self) -> list[nn.Parameter]:
         """The parameters that the actor loss trains: all but those of the critic's encoder."""
@@ -183,13 +160,12 @@ class Critic(_CropsImages, ContinuousCritic):
     """
     SB3's critic around the encoder that the critic loss and the auxiliary loss train.
 
-    :param crop_size: Height and width in pixels that images are cropped to, None for no crop
     :param norm: None, ``"layer"`` or ``"batch"``, see ``networks.q_network``
-    :param kwargs: Those of SB3's critic
+    :param kwargs: Those of SB3's critic, and ``crop_size``
     """
 
-    def __init__(self, *args: Any, crop_size: int | None = None, norm: str | None = None, **kwargs: Any):
-        super().__init__(*args, crop_size=crop_size, **kwargs)
+    def __init__(self, *args: Any, norm: str | None = None, **kwargs: Any):
+        super().__init__(*args, **kwargs)
         self.norm = norm
         if norm is not None:
             inputs = kwargs["features_dim"] + get_action_dim(self.action_space)
@@ -199,31 +175,16 @@ class Critic(_CropsImages, ContinuousCritic):
         self.train()
 
     def trunk(self, obs: PyTorchObs) -> Trunk:
-        """
-        All of the encoder but its projection; all of it where it has none.
-
-        :param obs: Observations (batch, ...)
-        """
+        """All of the encoder but its projection, of observations (batch, ...); all of it where it has none."""
         return Trunk(parts(self.features_extractor)[0](self.preprocess(obs)))
 
     def encode(self, obs: PyTorchObs | Trunk) -> th.Tensor:
-        """
-        Latent states.
-
-        :param obs: Observations (batch, ...), or their trunk
-        :return: (batch, features_dim)
-        """
+        """Latent states (batch, features_dim) of observations (batch, ...), or of their trunk."""
         trunk = obs if isinstance(obs, Trunk) else self.trunk(obs)
         return parts(self.features_extractor)[1](trunk.values).float()
 
     def q_values(self, latent: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        """
-        Q-values of all critics.
-
-        :param latent: Latent states (batch, features_dim)
-        :param actions: (batch, action_dim), scaled to [-1, 1]
-        :return: One (batch, 1) for each critic
-        """
+        """One (batch, 1) for each critic; of latent states (batch, features_dim), actions (batch, action_dim) in [-1, 1]."""
         inputs = th.cat([latent, actions], dim=1)
         return tuple(q_network(inputs).float() for q_network in self.q_networks)
 
@@ -311,9 +272,9 @@ class SACAuxPolicy(SACPolicy):
         normalize_images = kwargs.get("normalize_images", True)
         if kwargs.get("optimizer_class", th.optim.Adam) in (th.optim.Adam, th.optim.AdamW):
             kwargs["optimizer_kwargs"] = {"betas": (0.5, 0.999), **(kwargs.get("optimizer_kwargs") or {})}
-        self.augmentation = resolve_augmentation(augmentation, observation_space, crop_size, not normalize_images)
+        resolved = resolve_augmentation(augmentation, observation_space, crop_size, not normalize_images)
+        self.augmentation, self.crop_size = resolved
         self.image_keys = frozenset(image_spaces(observation_space, not normalize_images))
-        self.crop_size = CROP_SIZE if crop_size is None else crop_size
         self.squash_log_std = squash_log_std
         self.ortho_init = ortho_init
         self.critic_norm = critic_norm
@@ -367,49 +328,32 @@ class SACAuxPolicy(SACPolicy):
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         space = self.observation_space
-        if self.crops:
+        if self.crop_size is not None:
             space = cropped_space(space, self.crop_size, not self.normalize_images)
         # Encoder and momentum encoder each get a copy of a network among the arguments.
         kwargs: dict[str, Any] = dict(self.features_extractor_kwargs)
         kwargs |= {name: copy.deepcopy(value) for name, value in kwargs.items() if isinstance(value, nn.Module)}
         return self.features_extractor_class(space, **kwargs)
 
-    @property
-    def crops(self) -> bool:
-        """Whether images are cropped, at random in training and to the centre elsewhere."""
-        return self.augmentation == "random_crop"
-
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return Actor(
-            **kwargs,
-            crop_size=self.crop_size if self.crops else None,
-            squash_log_std=self.squash_log_std,
-        ).to(self.device)
+        return Actor(**kwargs, crop_size=self.crop_size, squash_log_std=self.squash_log_std).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         # To SB3 "shared" means that the critic does not train the encoder. Here it always does.
         kwargs["share_features_extractor"] = False
-        return Critic(
-            **kwargs,
-            crop_size=self.crop_size if self.crops else None,
-            norm=self.critic_norm,
-        ).to(self.device)
+        return Critic(**kwargs, crop_size=self.crop_size, norm=self.critic_norm).to(self.device)
 
     def augment(self, obs: PyTorchObs) -> PyTorchObs:
-        """
-        Augment the images of a batch or of windows, each at random; what was cropped already stays as it is.
-
-        :param obs: Observations (batch, ...) or (batch, time, ...); vectors stay as they are
-        """
+        """Images of observations (batch, ...) or (batch, time, ...), each augmented at random unless cropped already."""
 
         def augment(images: th.Tensor) -> th.Tensor:
             if images.ndim == 5:
                 # In the buffer's windows, memory is ordered by time first.
                 times = images.transpose(0, 1)
                 return augment(times.flatten(end_dim=1)).unflatten(0, times.shape[:2]).transpose(0, 1)
-            return random_crop(images, self.crop_size) if self.augmentation == "random_crop" else random_shift(images)
+            return random_shift(images) if self.crop_size is None else random_crop(images, self.crop_size)
 
         return obs if self.augmentation == "none" else map_images(obs, self.image_keys, augment)
 

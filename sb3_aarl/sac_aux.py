@@ -1,7 +1,6 @@
 """SACAux: Soft Actor-Critic whose encoder is also trained with an auxiliary loss."""
 
 import copy
-import io
 import logging
 import math
 import warnings
@@ -410,7 +409,8 @@ class SACAux(SAC):
         buffer, env, windows = self.replay_buffer, self._vec_normalize_env, None
         augment: Callable[[Any], Any] = self.policy.augment
         # Cropped while frames are gathered, which copies less: augment() finds nothing left to crop.
-        crop = {"crop_size": self.policy.crop_size} if self.policy.crops and isinstance(buffer, WindowReplayBuffer) else {}
+        size = self.policy.crop_size
+        crop = {"crop_size": size} if size is not None and isinstance(buffer, WindowReplayBuffer) else {}
         batch = buffer.sample(batch_size, env, **crop)  # type: ignore[union-attr]
         batch = batch._replace(observations=augment(batch.observations), next_observations=augment(batch.next_observations))
         if self.aux_head is not None:
@@ -537,11 +537,7 @@ class SACAux(SAC):
         return copy.deepcopy({**state, "q_value_check": vars(self._q_value_check)})
 
     def load_training_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Continue from the state of another model with the same settings.
-
-        :param state: A return value of :meth:`training_state`
-        """
+        """Continue from the :meth:`training_state` of another model with the same settings."""
         # Copied, since PyTorch's optimizers keep the tensors that they load.
         self.set_parameters(copy.deepcopy(state["parameters"]), device=self.device)
         for name, value in state["tensors"].items():
@@ -549,13 +545,6 @@ class SACAux(SAC):
         for name, value in state["counters"].items():
             setattr(self, name, value)
         self._q_value_check = QValueCheck(**state["q_value_check"])
-
-    def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        replay_buffer = vars(self).get("replay_buffer")
-        super().load_replay_buffer(path, truncate_last_traj)
-        if self.aux_loss is not None and not isinstance(self.replay_buffer, WindowReplayBuffer):
-            name, self.replay_buffer = type(self.replay_buffer).__name__, replay_buffer
-            raise ValueError(f"{name} has no windows, which aux_loss={self.aux_loss} needs: only aux_loss=None can load it")
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"

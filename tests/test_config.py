@@ -250,6 +250,7 @@ def test_values_have_the_types_of_the_arguments(tmp_path: Path, text: str, value
 def test_short_names_of_environments() -> None:
     assert resolve_env_id("cheetah-run") == resolve_env_id("dm_control/cheetah-run-v0") == "dm_control/cheetah-run-v0"
     assert resolve_env_id("Cheetah-Run") == "dm_control/cheetah-run-v0"  # the paper's
+    assert resolve_env_id("humanoid_CMU-run") == "dm_control/humanoid_CMU-run-v0"
     assert resolve_env_id("Pendulum-v1") == "Pendulum-v1"
     with pytest.raises(ConfigError, match="cheetah-run"):
         resolve_env_id("chetah-run")

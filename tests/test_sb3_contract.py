@@ -404,7 +404,7 @@ def test_an_encoder_derived_from_the_packages_own() -> None:
     observations = th.rand(5, 3)
     encoder = model.critic.features_extractor
     with th.no_grad():
-        expected = 2 * encoder.project(encoder.trunk(observations))
+        expected = 2 * encoder.projection(encoder.trunk(observations))
         th.testing.assert_close(model.critic.encode(observations), expected)
         read = model.actor.extract_features(observations, model.actor.features_extractor)
         th.testing.assert_close(read, model.actor.features_extractor.projection(expected))

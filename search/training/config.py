@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_aarl import SACAux, catalog
-from sb3_aarl.envs import NEEDS_DMC, PREFIX, env_ids, make_dmc_env, wrap_env
+from sb3_aarl.envs import NEEDS_DMC, PREFIX, env_ids, find_task, make_dmc_env, wrap_env
 from sb3_aarl.files import ConfigError, read_yaml
 
 # How several environments run, under the names of RL-Zoo's option --vec-env.
@@ -114,9 +114,8 @@ def resolve_env_id(name: str) -> str:
     """The id of an environment, registered or the short form of a DeepMind Control task, such as ``Cheetah-Run``."""
     if name in gym.registry:
         return name
-    full = f"{PREFIX}{name.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
-    if full in env_ids():
-        return full
+    if (task := find_task(name)) is not None:
+        return task
     known = [*gym.registry, *(task.removeprefix(PREFIX).removesuffix("-v0") for task in env_ids())]
     nearest = ", ".join(difflib.get_close_matches(name, known))
     hint = f", nearest: {nearest}" if nearest else ""

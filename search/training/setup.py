@@ -32,7 +32,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_aarl import AuxLoss, SACAux
-from sb3_aarl.callbacks import SingleEpisodes
 from sb3_aarl.envs import EPISODE_LENGTH, PREFIX, make_dmc_env, wrap_env
 from sb3_aarl.sac_aux import default_learning_starts
 
@@ -112,7 +111,7 @@ class Setup:
         # longer than the prediction from it, and each environment that renders has tens of megabytes for it.
         episodes = self.run.evaluation_episodes
         n_envs, vec_env = (min(self.n_envs, episodes), self.vec_env) if self.pixels else (episodes, DummyVecEnv)
-        env = make_vec_env(self._make(), n_envs, seed=0, vec_env_cls=vec_env, wrapper_class=SingleEpisodes)
+        env = make_vec_env(self._make(), n_envs, seed=0, vec_env_cls=vec_env)
         return env if self.normalize is None else VecNormalize(env, **{**self.normalize, **FIXED})
 
     def model(self, env: VecEnv) -> SACAux:
