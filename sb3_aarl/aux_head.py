@@ -58,13 +58,7 @@ class AuxHead(nn.Module):
     :param predictor_width: Hidden units of the predictor, None for twice its input
     """
 
-    def __init__(
-        self,
-        loss: AuxLoss,
-        latent_dim: int,
-        action_dim: int,
-        predictor_width: int | None = 256,
-    ):
+    def __init__(self, loss: AuxLoss, latent_dim: int, action_dim: int, predictor_width: int | None = 256):
         super().__init__()
         self.loss = loss
         width = {"s": latent_dim, "a": action_dim, "r": 1}
@@ -100,11 +94,7 @@ class AuxHead(nn.Module):
             return self.operator(prediction, target)
 
     def _embed(
-        self,
-        windows: WindowSamples,
-        tokens: Sequence[Token],
-        positions: slice,
-        encode: Callable[[PyTorchObs], th.Tensor],
+        self, windows: WindowSamples, tokens: Sequence[Token], positions: slice, encode: Callable[[PyTorchObs], th.Tensor]
     ) -> th.Tensor:
         """Latent states, actions and rewards of the tokens side by side, (batch, d); all states in one encoder pass."""
         parts: list[th.Tensor] = []

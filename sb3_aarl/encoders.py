@@ -58,12 +58,7 @@ class PixelEncoder(Encoder):
     """
 
     def __init__(
-        self,
-        observation_space: spaces.Box,
-        features_dim: int = 50,
-        n_layers: int = 4,
-        n_filters: int = 32,
-        tanh: bool = False,
+        self, observation_space: spaces.Box, features_dim: int = 50, n_layers: int = 4, n_filters: int = 32, tanh: bool = False
     ):
         channels, height, width = observation_space.shape
         # Size after the first convolution (stride 2), then two pixels less for each further one.
@@ -168,11 +163,7 @@ class SimbaEncoder(Encoder):
     """
 
     def __init__(
-        self,
-        observation_space: spaces.Space,
-        features_dim: int = 64,
-        normalize: bool = True,
-        observation: bool = True,
+        self, observation_space: spaces.Space, features_dim: int = 64, normalize: bool = True, observation: bool = True
     ):
         inputs = get_flattened_obs_dim(observation_space)
         latent_dim = features_dim + inputs * observation

@@ -57,8 +57,9 @@ class AuxLossSampler(Settings, BaseSampler):
     parameters of a loss take a random slot if there is one.
 
     Trials that are pruned, have no finite score or violate a constraint (``trial.set_constraint``) are parents only if there
-    are no others. What is searched beside the loss is inherited from a parent or, every other time, drawn anew. Other samplers
-    may hold this one (``PartialFixedSampler``, ``independent_sampler``): the loss of a trial is the one of its parameters.
+    are no others. What is searched beside the loss is inherited from a parent or, every other time, drawn at random. Other
+    samplers may hold this one (``PartialFixedSampler``, ``independent_sampler``): the loss of a trial is the one of its
+    parameters.
 
     Asking never waits. A trial that finds no free slot gets an extra one, as the next generation would have it, so that
     no generation waits for trials that a killed process left RUNNING. Two processes that ask at the same moment may train one
