@@ -1,11 +1,10 @@
 """What commands print: text, tables, progress."""
 
 import contextlib
-import json
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.live import Live
@@ -32,11 +31,6 @@ class Messages(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message."""
         errors.print(self.format(record), markup=False, highlight=False)
-
-
-def say_json(data: Any) -> None:
-    """Print plain values as JSON."""
-    say(json.dumps(data, indent=1))
 
 
 @contextlib.contextmanager

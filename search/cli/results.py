@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 from sb3_aarl.search.cli import options
-from sb3_aarl.search.cli.console import say, say_json, show_table
+from sb3_aarl.search.cli.console import say, show_table
 from sb3_aarl.search.cli.options import Storage, open_study, search_folder
 
 app = typer.Typer()
@@ -22,7 +22,7 @@ def table(
 
     found = tables.read_tables(folder)
     if json:
-        say_json(tables.as_data(found))
+        say(tables.as_json(found))
         return
     for title, shown in tables.text_tables(found).items():
         show_table(shown, title)

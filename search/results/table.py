@@ -208,12 +208,12 @@ def _few(better: pd.DataFrame) -> pd.DataFrame:
     return better[(n_variants <= MANY) | (losses == losses.groupby(better["checkpoint"]).transform("min"))]
 
 
-def as_data(tables: Tables) -> dict[str, Any]:
-    """All that is shown, in plain values for JSON."""
+def as_json(tables: Tables) -> str:
+    """All that is shown, as JSON."""
     runs, comparison, iqm, better = tables
     frames = {"scores": comparison, "interquartile_means": iqm, "improvements": better, "runs": runs}
     records = {name: json.loads(frame.to_json(orient="records", double_precision=15)) for name, frame in frames.items()}
-    return {**records, "missing": missing(runs)}
+    return json.dumps({**records, "missing": missing(runs)}, indent=1)
 
 
 def _steps(checkpoint: Any) -> str:

@@ -56,17 +56,12 @@ class Variant(NamedTuple):
     source: str
 
 
-def read_experiment(path: Path) -> Experiment:
-    """Read a ``variants.yml``."""
-    return validated(Experiment, read_yaml(path), str(path))
-
-
 def read_variants(path: Path) -> list[Variant]:
     """The variants in a file: those of a ``variants.yml``, or one with the name of a file of hyper-parameters."""
     entries = read_yaml(path)
     if "variants" not in entries:
         return [Variant(path.stem, path, entries, str(path))]
-    experiment = read_experiment(path)
+    experiment = validated(Experiment, entries, str(path))
     base = experiment.base
     entries = read_yaml(find_file(Path(base), folder=path.parent)) if isinstance(base, str) else base
     return [
@@ -151,9 +146,10 @@ def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     """
     abouts: dict[Path, dict[str, Any]] = {}
     folders: dict[Cell, Path] = {}
-    experiment = folder / VARIANTS
-    parts = (RUNS, *read_experiment(experiment).runs) if experiment.exists() else ("",)
-    for path in sorted(file.parent for part in parts for file in (folder / part).rglob(ABOUT)):
+    file, parts = folder / VARIANTS, [""]
+    if file.exists():
+        parts = [RUNS, *validated(Experiment, read_yaml(file), str(file)).runs]
+    for path in sorted(found.parent for part in parts for found in (folder / part).rglob(ABOUT)):
         about = {"sessions": [], **read_about(path)}
         if "checkpoints" not in about:  # of another matrix
             continue
