@@ -34,7 +34,7 @@ SOURCE = "results/make_tables.py"
 GUIDES = ("expect.md", "from_sac.md", "losses.md", "paper.md", "results.md")
 PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in GUIDES)]
 # The columns of the main table, and their variants in agent/proof/runs.
-PROVED = {"SACAux": "sac_aux", "`n_steps=3`": "n_steps_3", "no loss": "n_steps_3_no_loss", "SAC": "sac", "CrossQ": "crossq"}
+PROVED = {"SACAux": "sac_aux", "no loss": "no_loss", "SAC": "sac", "CrossQ": "crossq"}
 # What a search does to losses; the others are drawn at random, from priors, or given.
 EVOLVED = ("crossover", "replacement", "horizon_change")
 DRAWN, BEST = 20, 10
@@ -85,7 +85,7 @@ def readme_table(rows: list[list[str]] | dict[str, list[str]]) -> str:
 
 def proof_row(name: str, values: list[str]) -> list[str]:
     """A row of the main table: our runs where there are some, else a published mean, else a dash."""
-    if len(values) > len(PROVED):
+    if isinstance(values[-1], str):
         return [name, *values]
     task, sac, crossq, best, _ = values
     published = {"sac": sac, "crossq": crossq}
@@ -101,7 +101,7 @@ def sentence(text: str, rows: Iterable[list[Any]]) -> str:
     """
     found = []
     for task, sac, _, _, drq in rows:
-        if last := last_returns(RESULTS / "agent/proof/runs/n_steps_3" / task):
+        if last := last_returns(RESULTS / "agent/proof/runs/sac_aux" / task):
             mean = statistics.mean(last)
             found.append((mean / drq, mean / float(sac.strip("_").partition(" ")[0].replace(",", ""))))
     share, times = map(statistics.median, zip(*found, strict=True))

@@ -16,12 +16,13 @@ from sb3_aarl.search.execution.storage import load_study, open_storage
 from sb3_aarl.search.results.analysis import analysed, trial_table
 from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.studies import benchmark
-from sb3_aarl.search.studies.benchmark import load_benchmark, read_experiment
+from sb3_aarl.search.studies.benchmark import load_benchmark
 from scipy.stats import mannwhitneyu
 from typer.testing import CliRunner
 
 from sb3_aarl.callbacks import Evaluation, read_curve, write_curve
 from sb3_aarl.catalog import resolve
+from sb3_aarl.files import read_yaml
 
 RESULTS = Path(__file__).parent.parent / "results"
 ABOUTS = sorted(RESULTS.glob("*/*/about.md"))
@@ -105,7 +106,7 @@ def test_figures_in_the_text_of_the_first_readme() -> None:
     assert {*re.findall(r"(?<![\w.])\d{2,}[\d,]*\b(?!\.)", by_hand)} == {"100,000", "2022"}, (
         "numbers of runs come from a script"
     )
-    ours = {task: returns("agent/proof/n_steps_3", task) for task in PUBLISHED}
+    ours = {task: returns("agent/proof/sac_aux", task) for task in PUBLISHED}
     medians = [
         statistics.median(statistics.mean(ours[task]) / PUBLISHED[task][i] for task in PUBLISHED if ours[task]) for i in (0, 1)
     ]
@@ -137,7 +138,7 @@ def test_a_search_found_what_its_texts_say() -> None:
     figures += [f"{len(trials)} candidates", f"{given.max():.0f}", f"AARL-State {baselines['AARL-State']:.0f}"]
     # What is confirmed is what the cross-validation ranks first, and the best evolved loss, its second.
     ranked = make_tables["mean_scores"](stored_scores(folder / "cross-validation"))["mean"]
-    variants = read_experiment(RESULTS / "search/confirmation/variants.yml").variants
+    variants = read_yaml(RESULTS / "search/confirmation/variants.yml")["variants"]
     assert [str(resolve(variants[f"{name}_simba"]["aux_loss"])) for name in ("published", "evolved")] == list(ranked.index[:2])
     figures += [f"{score:.0f}" for score in ranked[:2]]
     assert [figure for figure in figures if figure not in README] == []
