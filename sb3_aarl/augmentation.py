@@ -9,6 +9,13 @@ AUGMENTATIONS = ("auto", "random_crop", "random_shift", "none")
 CROP_SIZE = 84  # paper, table 7
 
 
+def _check_crop(images: th.Tensor, size: int) -> None:
+    if images.ndim != 4 or min(images.shape[2:]) < size:
+        raise ValueError(
+            f"cannot crop images of shape {tuple(images.shape)} (batch, channels, height, width) to {size} x {size}"
+        )
+
+
 def cut(images: th.Tensor, numbers: th.Tensor, top: th.Tensor, left: th.Tensor, height: int, width: int) -> th.Tensor:
     """
     Parts of images, (..., channels, height, width), without a copy of the images that they are cut from.
@@ -32,7 +39,9 @@ def random_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
 
     :param images: (batch, channels, height, width), any dtype
     :param size: Height and width in pixels of what is kept
+    :raises ValueError: when the images are smaller
     """
+    _check_crop(images, size)
     batch, _, height, width = images.shape
     if height == width == size:
         return images
@@ -61,7 +70,9 @@ def center_crop(images: th.Tensor, size: int = 84) -> th.Tensor:
 
     :param images: (batch, channels, height, width), any dtype
     :param size: Height and width in pixels of what is kept
+    :raises ValueError: when the images are smaller
     """
+    _check_crop(images, size)
     top, left = ((length - size) // 2 for length in images.shape[2:])
     return images[:, :, top : top + size, left : left + size]
 

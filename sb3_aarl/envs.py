@@ -76,8 +76,11 @@ def env_ids() -> list[str]:
 
 def find_task(name: str) -> str | None:
     """The id of a task by it or by its short form, such as ``Cheetah-Run`` or ``humanoid_CMU-run``; None if there is none."""
-    by_name = {env_id.lower(): env_id for env_id in env_ids()}
-    return by_name.get(f"{PREFIX}{name.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0")
+    return {env_id.lower(): env_id for env_id in env_ids()}.get(_long_form(name))
+
+
+def _long_form(name: str) -> str:
+    return f"{PREFIX}{name.lower().removeprefix(PREFIX).removesuffix('-v0')}-v0"
 
 
 def make_dmc_env(
@@ -114,7 +117,7 @@ def make_dmc_env(
     if not known:
         raise ImportError(NEEDS_DMC)
     if task is None:
-        nearest = ", ".join(difflib.get_close_matches(env_id, known, cutoff=0.4)) or f"something like {known[0]}"
+        nearest = ", ".join(difflib.get_close_matches(_long_form(env_id), known, cutoff=0.4)) or f"something like {known[0]}"
         raise ValueError(f"unknown DeepMind Control task {env_id!r}, nearest: {nearest}")
     env_id = task
     domain = env_id.removeprefix(PREFIX).partition("-")[0]

@@ -129,6 +129,10 @@ class Actor(_CropsImages, SB3Actor):
         super().__init__(*args, **kwargs)
         self.squash_log_std = squash_log_std
 
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {"crop_size": self.crop_size, "squash_log_std": self.squash_log_std}
+        return super()._get_constructor_parameters() | own
+
     def own_parameters(self) -> list[nn.Parameter]:
         """The parameters that the actor loss trains: all but those of the critic's encoder."""
         extractor = self.features_extractor

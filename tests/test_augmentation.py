@@ -99,3 +99,11 @@ def test_center_crop(height: int, width: int, size: int, corner: tuple[int, int]
 def test_default_sizes_are_the_papers() -> None:
     images = pictures(2, 9, 100, 100, th.uint8)
     assert random_crop(images).shape == center_crop(images).shape == (2, 9, 84, 84)
+
+
+@pytest.mark.parametrize("crop", [random_crop, center_crop])
+@pytest.mark.parametrize("shape", [(2, 3, 83, 84), (2, 3, 84, 83), (3, 84, 84)])
+def test_images_that_are_too_small(crop, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"cannot crop images of shape \(.*\) .* to 84 x 84") as error:
+        crop(th.zeros(shape), 84)
+    assert str(shape) in str(error.value)

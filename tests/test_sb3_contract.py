@@ -279,8 +279,18 @@ def test_gsde(use_expln: bool) -> None:
     policy_kwargs = {"use_expln": use_expln, "log_std_init": -2.0, "clip_mean": 1.5}
     model = make_model(use_sde=True, sde_sample_freq=4, use_sde_at_warmup=True, train_freq=8, policy_kwargs=policy_kwargs)
     assert (model.actor.log_std == -2).all()
+    resampled = []
+    reset_noise = model.actor.reset_noise
+    model.actor.reset_noise = lambda *args: (resampled.append(model.num_timesteps), reset_noise(*args))[1]
     assert_all_train(model, 24)
+    # At the begin of each rollout of 8 steps, every 4 steps in it, and for the gradient step after it.
+    assert set(resampled) == {0, 4, 8, 12, 16, 20, 24}
+
+    observation = np.zeros(3, np.float32)
+    first = model.predict(observation)[0]
+    np.testing.assert_array_equal(first, model.predict(observation)[0])  # the noise is a function of the state
     model.actor.reset_noise()
+    assert not np.array_equal(first, model.predict(observation)[0])
     model.policy.zero_grad()
     model.actor.action_log_prob(th.ones(4, 3))[1].sum().backward()
     assert all(parameter.grad is None for parameter in model.critic.features_extractor.parameters())

@@ -6,8 +6,24 @@ import numpy as np
 import pytest
 import torch as th
 from test_sac_aux import KINDS, assert_same, everything, filled_model, make_model
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_aarl import sac_aux
+
+PRODUCTS = {"aten.mm", "aten.addmm", "aten.convolution", "aten.convolution_backward"}
+
+
+class Operations(TorchDispatchMode):
+    """The data types of each operation's inputs, by name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: dict[str, set[th.dtype]] = {}
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        inputs = {arg.dtype for arg in args if isinstance(arg, th.Tensor) and arg.is_floating_point()}
+        self.seen.setdefault(str(function).rpartition(".")[0], set()).update(inputs)
+        return function(*args, **(kwargs or {}))
 
 
 @pytest.mark.parametrize(("capability", "slow"), [("DEFAULT", True), ("AVX2", True), ("AVX512", False)])
@@ -39,10 +55,17 @@ def test_bfloat16_is_what_networks_compute_in_and_nothing_else(kind: str) -> Non
     model.aux_head.predictor.register_forward_hook(lambda *call: outputs.update(predictor=call[-1].dtype))
     losses: list[th.Tensor] = []
     model.aux_head.operator.register_forward_hook(lambda module, args, loss: losses.extend([*args, loss]))
-    model.train(2, batch_size=16)
+    with Operations() as operations:
+        model.train(2, batch_size=16)
 
     assert outputs == {"q": th.bfloat16, "predictor": th.bfloat16}
+    products = {name: operations.seen[name] for name in PRODUCTS & operations.seen.keys()}
+    # The similarity of predictions and targets is part of the loss, and stays float32.
+    assert products.pop("aten.mm") == {th.bfloat16, th.float32}
+    assert products and all(dtypes == {th.bfloat16} for dtypes in products.values())
     assert {tensor.dtype for tensor in losses} == {th.float32}
+    for name in ("aten.mse_loss", "aten.log", "aten.exp", "aten._fused_adam_"):
+        assert operations.seen[name] <= {th.float32}, name
     for tensor in (value for value in everything(model).values() if isinstance(value, th.Tensor)):
         assert tensor.dtype == th.float32
     for parameter in (*model.critic.parameters(), *model.aux_head.parameters(), *model.actor.own_parameters()):

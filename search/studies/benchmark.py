@@ -146,9 +146,8 @@ def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     """
     abouts: dict[Path, dict[str, Any]] = {}
     folders: dict[Cell, Path] = {}
-    file, parts = folder / VARIANTS, [""]
-    if file.exists():
-        parts = [RUNS, *validated(Experiment, read_yaml(file), str(file)).runs]
+    file = folder / VARIANTS
+    parts = (RUNS, *validated(Experiment, read_yaml(file), str(file)).runs) if file.exists() else ("",)
     for path in sorted(found.parent for part in parts for found in (folder / part).rglob(ABOUT)):
         about = {"sessions": [], **read_about(path)}
         if "checkpoints" not in about:  # of another matrix

@@ -62,7 +62,8 @@ def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselin
     if section is None:
         raise ConfigError(f"{config.path}: cross_validation is missing: environments, seeds, top")
     check_study(study, config, free=("threads",))
-    if {*config.seeds} & {*section.seeds} and {*config.tasks} & {*(section.environments or config.tasks)}:
+    environments = section.environments or tuple(config.tasks)
+    if {*config.seeds} & {*section.seeds} and {*config.tasks} & {*environments}:
         logger.warning("cross_validation.seeds has seeds of the search: scores that candidates were chosen for count again")
     losses, values = top_losses(study, section.top, section.top_rated), searched_values(config, study)
     candidates = [Baseline(name=str(loss), aux_loss=loss, overrides=merge_space({}, values[loss])) for loss in losses]
@@ -73,7 +74,7 @@ def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselin
     cells = [
         Cell(variant.name, environment, seed)
         for seed, some in (dict.fromkeys(section.seeds, variants) | dict.fromkeys(more, candidates)).items()
-        for environment, variant in product(section.environments or config.tasks, some)
+        for environment, variant in product(environments, some)
     ]
     by_name = {variant.name: variant for variant in variants}
     matrix = search_matrix(config, f"{config.name}-cross-validation", folder / "cross-validation", cells, by_name)
