@@ -1,4 +1,4 @@
-"""By task: how much losses differ beside their seeds (F) in the mean return up to each quarter; and two losses beside a third."""
+"""By task: how much losses differ beside their seeds (F), in the mean return up to each quarter; two losses beside a third."""
 
 from pathlib import Path
 
