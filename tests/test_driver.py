@@ -327,12 +327,16 @@ def test_enqueued_losses_are_trained_and_invalid_ones_cost_nothing(tmp_path: Pat
     executor, rng = Executor(), random.Random(0)
     search = start(tmp_path, executor)
     loss = AuxLoss.parse("{s_t, a_t} -> {s_t+1}")
+    make_runs = search.make_runs
+    search.make_runs = lambda trial: make_runs(trial) if trial.suggest_categorical("width", [8, 16]) else []
+    search.study.enqueue_trial({"width": 32})
     search.study.enqueue_trial({**loss_to_params(loss), "source/s_t": False})
     search.study.enqueue_trial(loss_to_params(loss))
     for _ in search:
         while executor.pending:
             executor.end(rng)
-    invalid, enqueued, *_ = search.study.trials
+    refused, invalid, enqueued, *_ = search.study.trials
+    assert refused.state == TrialState.FAIL and "32" in refused.user_attrs["reason"]
     assert invalid.state == TrialState.PRUNED and "curve" not in invalid.user_attrs
     assert (loss_of(enqueued), enqueued.state) == (loss, TrialState.COMPLETE)
     assert len(outcome(search)) == 7 + 6 + 6

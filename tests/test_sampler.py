@@ -465,8 +465,9 @@ def test_the_first_finished_trial_of_a_slot_counts() -> None:
         assert study.ask().user_attrs["parents"] == [1]
 
 
-def test_trials_of_other_samplers_have_no_slots() -> None:
+def test_trials_of_other_samplers_and_studies_have_no_slots() -> None:
     study = make_study()
+    study.add_trials(run(make_study(seed=1)).trials)
     other = optuna.load_study(study_name="study", storage=study._storage, sampler=optuna.samplers.RandomSampler(seed=0))
     other.ask().suggest_float("x", 0, 1)
     other.tell(other.ask(), 1.0)

@@ -19,6 +19,7 @@ from sb3_aarl.search.evolution.space import (
     forward_dynamics_prior,
     loss_of,
     loss_to_params,
+    other_params,
     params_to_loss,
     random_loss,
     reward_prediction_prior,
@@ -227,6 +228,8 @@ def test_the_loss_of_a_trial() -> None:
     for trial_params, expected in ((params, loss), ({}, None), ({"horizon": 1}, None), (no_source, None)):
         space = {name: distributions(1)[name] for name in trial_params}
         assert loss_of(optuna.create_trial(params=trial_params, distributions=space, value=0.0)) == expected
+    own = {"operator": "adam", "negatives": 3}  # a user's, where no operator is searched
+    assert (params_to_loss(params | own), other_params(params | own)) == (loss, own)
 
 
 @pytest.mark.filterwarnings("ignore:The value 13 of the parameter 'horizon' is out of the range")

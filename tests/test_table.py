@@ -299,22 +299,12 @@ def test_what_is_missing_is_counted_and_named(tmp_path: Path) -> None:
         "Missing at 500,000: aarl_state on cheetah-run, seeds 5, 6: not started",
         "Missing at 500,000: mine on cheetah-run, seed 0: unfinished, evaluated up to 0",
     ]
-    assert json.loads(table.as_json(found))["missing"] == lines
     early = iqm.set_index(["checkpoint", "variant"]).loc[100_000]
     assert list(early.index) == ["aarl_state", "sac_identity"]  # a variant without any run hides no others
     assert tuple(early.loc["aarl_state", ["planned", "runs"]]) == (7, 4)
     shown = printed(tmp_path)
     assert "473 ± 5 (4/7)" in shown and "│ 4/7 │" in shown
     assert "Runs with different commits: c0ffee (8); c0ffee, beef (1)" in shown
-
-
-def test_the_same_as_data(planted: pd.DataFrame, tmp_path: Path) -> None:
-    found = table.read_tables(tmp_path)
-    data = json.loads(table.as_json(found))
-    assert data.pop("missing") == []
-    for name, frame in zip(("runs", "scores", "interquartile_means", "improvements"), found, strict=True):
-        same = pd.DataFrame(data[name], columns=list(frame.columns)).astype(frame.dtypes.to_dict())
-        pd.testing.assert_frame_equal(same, frame, check_exact=False)
 
 
 def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:

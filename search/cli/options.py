@@ -24,7 +24,6 @@ Imports = Annotated[str, Option(help="Modules of yours that register environment
 DryRun = Annotated[
     bool, Option("--dry-run", help="Start nothing: measure some steps here, and show what all runs would cost.")
 ]
-Json = Annotated[bool, Option("--json", help="Print JSON instead.")]
 Folder = Annotated[Path | None, Option(help="Folder of the search. Default: runs/ and the name of the configuration file.")]
 Benchmark = Annotated[Path, Argument(help="Folder of a benchmark.")]
 SearchFolder = Annotated[

@@ -13,17 +13,11 @@ app = typer.Typer()
 
 
 @app.command(rich_help_panel="Many agents")
-def table(
-    folder: options.Benchmark = options.BENCHMARK,
-    json: options.Json = False,
-) -> None:
+def table(folder: options.Benchmark = options.BENCHMARK) -> None:
     """Show a benchmark: means and deviations, interquartile means and probabilities of improvement."""
     from sb3_aarl.search.results import table as tables
 
     found = tables.read_tables(folder)
-    if json:
-        say(tables.as_json(found))
-        return
     for title, shown in tables.text_tables(found).items():
         show_table(shown, title)
     for line in tables.missing(found.runs) + tables.mixed(found.runs):

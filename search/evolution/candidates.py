@@ -124,6 +124,8 @@ class Candidates:
     def of_slot(self, generation: int, slot: int, attempt: int) -> Candidate:
         """The candidate of a slot of a generation (from 1), of which ``attempt`` candidates have failed."""
         if slot >= len(self.settings.operations(generation)):
+            while self.to_plan:
+                self._plan_next()
             return self._draw(generation, slot, 0, self.seen.__contains__)
         if attempt == 0:
             while (generation, slot) not in self.plan:

@@ -77,7 +77,8 @@ class AuxLossSampler(Settings, BaseSampler):
     :param operators: Operators to search too, as in ``suggest_aux_loss``; None for mean squared error (paper, 2.2)
     :param allow_duplicates: Whether a loss may be trained again, as in the paper; else a candidate whose canonical form is
         already there is redrawn
-    :param seed: Seed of the evolution, not negative; None for a random one. A study keeps its first seed
+    :param seed: Seed of the evolution, not negative; None for a random one. A study keeps its first seed; processes that start
+        one at the same moment need the same
     :param screening: Offspring that are drawn for each slot, of which the one is kept that the Gaussian process, fitted to the
         generations before, rates highest under one posterior draw; 1 for the paper's evolution
     :param n_generations: Number of generations, for ``free_slots`` and ``stop_when_complete``; None for no end
@@ -255,12 +256,13 @@ class _Slots:
         self.running.clear()
         finished = []
         for trial in changed:
-            if SLOT_KEY in trial.system_attrs:
-                at = trial.system_attrs[SLOT_KEY]["generation"], trial.system_attrs[SLOT_KEY]["slot"]
+            key = trial.system_attrs.get(SLOT_KEY)
+            if key is not None and key["seed"] == self.candidates.seed:  # not added from another study
+                at = key["generation"], key["slot"]
                 self.last_started = max(self.last_started, at[0])
                 if trial.state.is_finished():
                     finished.append((trial.datetime_complete, trial.number, at))
-                else:
+                elif trial.state == TrialState.RUNNING:
                     self.running.add(at)
         for _, number, at in sorted(finished):
             self._finish(trials[number], *at)
@@ -322,7 +324,8 @@ class _Slots:
             key |= {"enqueued": number + 1, "operation": "enqueued", "parents": [], "loss": None, SEED_INDEX_KEY: 0}
             return {SLOT_KEY: key}
         if again := self.interrupted.get(free[0]):  # its runs are there already: with all its parameters
-            return {SLOT_KEY: again.system_attrs[SLOT_KEY], FIXED_KEY: again.system_attrs.get(FIXED_KEY, {}) | again.params}
+            # The slot last: what has one is whole, also if the database is away in between.
+            return {FIXED_KEY: again.system_attrs.get(FIXED_KEY, {}) | again.params, SLOT_KEY: again.system_attrs[SLOT_KEY]}
         loss, operation, parents, seed_index = self.candidates.of_slot(generation, slot, attempt)
         key |= {"operation": operation, "parents": list(parents), "loss": str(loss), SEED_INDEX_KEY: seed_index}
         return {SLOT_KEY: key}

@@ -82,14 +82,18 @@ def params_to_loss(params: Mapping[str, Any]) -> AuxLoss:
     """
     horizon = params["horizon"]
     source, target = (tuple(params[name] for name in names) for names in token_names(horizon))
-    # Without negatives beside it, an "operator" is a parameter of the user's own.
-    operator = params["operator"] if "negatives" in params else "mse"
-    return AuxLoss(int(horizon), source, target, operator, params.get("negatives", False))
+    operator = (params["operator"], params["negatives"]) if _has_operator(params) else ()
+    return AuxLoss(int(horizon), source, target, *operator)
+
+
+def _has_operator(params: Mapping[str, Any]) -> bool:
+    """Whether the operator was searched; else parameters of these names are a user's own."""
+    return params.get("operator") in OPERATORS and isinstance(params.get("negatives"), bool)
 
 
 def other_params(params: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters of a trial beside those of its loss."""
-    own = ("horizon", "operator", "negatives") if "negatives" in params else ("horizon",)
+    own = ("horizon", "operator", "negatives") if _has_operator(params) else ("horizon",)
     return {name: value for name, value in params.items() if name not in own and not name.startswith(("source/", "target/"))}
 
 

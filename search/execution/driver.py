@@ -145,6 +145,9 @@ class Driver:
             logger.warning("Trial %d: %s", trial.number, problem)
             self._tell(trial, state=TrialState.PRUNED)
             return
+        except ValueError as problem:  # so is what is searched beside the loss, which Optuna refuses
+            self._fail(trial, str(problem))
+            return
         about = {"loss": runs[0].aux_loss, "threads": runs[0].threads, "commit": commit(), "versions": versions()}
         self._note(trial, about)
         tasks = [list(task) for _, task in groupby(runs, lambda run: run.environment)]

@@ -208,14 +208,6 @@ def _few(better: pd.DataFrame) -> pd.DataFrame:
     return better[(n_variants <= MANY) | (losses == losses.groupby(better["checkpoint"]).transform("min"))]
 
 
-def as_json(tables: Tables) -> str:
-    """All that is shown, as JSON."""
-    runs, comparison, iqm, better = tables
-    frames = {"scores": comparison, "interquartile_means": iqm, "improvements": better, "runs": runs}
-    records = {name: json.loads(frame.to_json(orient="records", double_precision=15)) for name, frame in frames.items()}
-    return json.dumps({**records, "missing": missing(runs)}, indent=1)
-
-
 def _steps(checkpoint: Any) -> str:
     return f"{checkpoint // 1000}K" if checkpoint % 1000 == 0 else f"{checkpoint:,}"
 
