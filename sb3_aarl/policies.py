@@ -178,6 +178,10 @@ class Critic(_CropsImages, ContinuousCritic):
                 setattr(self, f"qf{i}", self.q_networks[i])
         self.train()
 
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        # SB3's would compute gradients under no_grad() too, which a running normalisation takes for a training step.
+        return self.q_values(self.encode(obs), actions)
+
     def trunk(self, obs: PyTorchObs) -> Trunk:
         """All of the encoder but its projection, of observations (batch, ...); all of it where it has none."""
         return Trunk(parts(self.features_extractor)[0](self.preprocess(obs)))
@@ -248,7 +252,7 @@ class SACAuxPolicy(SACPolicy):
         (CrossQ, Bhatt et al., 2024); rewards divided by their mean magnitude in the first batch if that is above 1;
         ``"layer"``: layer norm in them; None (SB3)
     :param kwargs: activation_fn, use_sde, log_std_init, use_expln, clip_mean, normalize_images, optimizer_class,
-        optimizer_kwargs and n_critics of SB3's SACPolicy; Adam's ``betas`` are (0.5, 0.999) unless given (CrossQ)
+        optimizer_kwargs and n_critics of SB3's SACPolicy; ``betas`` of Adam and AdamW are (0.5, 0.999) unless given (CrossQ)
     """
 
     actor: Actor

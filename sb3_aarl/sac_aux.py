@@ -52,20 +52,23 @@ class SACAux(SAC):
     Soft Actor-Critic whose encoder is also trained with an auxiliary loss (paper, section 3), around SB3's SAC.
 
     The encoder is the critic's: the critic loss and the auxiliary loss train it, the actor reads it detached. The encoder
-    of the target critic is the momentum encoder of the auxiliary loss. Arguments that are not here are SB3's.
+    of the target critic is the momentum encoder of the auxiliary loss; with batch norm the target Q networks read the
+    encoder itself. Arguments that are not here are those of SB3's SAC.
 
-    Defaults that are not SAC's are CrossQ's (learning rate, updates of the actor, batch norm in the Q networks, here with
-    target networks) and SimBa's (entropy, random steps). With all of SAC's and ``aux_loss=None`` it is SB3's SAC, to the
-    bit: ``zoo_configs/sac.yml`` has them.
+    Defaults that are not SAC's are CrossQ's (learning rate, Adam's betas, updates of the actor, batch norm in the Q networks,
+    here with target networks) and SimBa's (entropy, random steps). With all of SAC's and ``aux_loss=None`` it is SB3's SAC, to
+    the bit: ``zoo_configs/sac.yml`` has them.
 
     :param policy: ``"MlpPolicy"`` (``simba`` encoder), ``"CnnPolicy"`` (CURL's encoder), ``"MultiInputPolicy"`` or a class
     :param env: The environment, or its registered name
-    :param learning_rate: Of all optimizers that have none of their own, may be a schedule
+    :param learning_rate: Learning rate or schedule of actor, critic, entropy coefficient and auxiliary loss, unless the last
+        two have their own
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
-    :param learning_starts: Agent steps with random actions before learning starts; None (default) for 5,000, or a tenth
-        of each ``learn`` if that is less
+    :param learning_starts: Agent steps with random actions before learning starts; None (default, until ``learn``) for 5,000,
+        or a tenth of each ``learn`` if that is less
     :param batch_size: Transitions for each critic and actor update
-    :param tau: Polyak coefficient of the target Q networks; 1 for none, as in CrossQ; 0 freezes the target critic's weights
+    :param tau: Polyak coefficient of the target Q networks; 1 copies them at each update (no targets, as in CrossQ); 0 freezes
+        the target critic's weights
     :param gamma: Discount factor
     :param replay_buffer_class: None for ``WindowReplayBuffer``; one that is not derived from it has no auxiliary loss
     :param replay_buffer_kwargs: Its arguments. ``frame_stack`` is detected from the wrappers unless given. If one that
@@ -297,7 +300,7 @@ class SACAux(SAC):
             update_learning_rate(self.aux_optimizer, self._aux_schedule(self._current_progress_remaining))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        # Batch norm and dropout of the networks that learn; the target critic stays in evaluation mode.
+        # Batch norm and dropout of the networks that learn.
         self.policy.set_training_mode(True)
         self._update_learning_rates()
         # Networks compute in bfloat16 if asked to; their outputs, and all that is computed from them, are float32.
@@ -439,7 +442,7 @@ class SACAux(SAC):
         (self._aux.coef * aux_loss).backward()
 
     def _update_target(self) -> None:
-        # tau=0 freezes all weights of the target critic, as in SB3: a moving encoder would detach its Q networks from it.
+        # tau=0 freezes all weights of the target critic, as in SB3.
         if self.tau > 0:
             polyak_update(self.critic.q_parameters, self.critic_target.q_parameters, self.tau)
             polyak_update(self.critic.encoder_parameters, self.critic_target.encoder_parameters, self._aux.tau)
@@ -464,6 +467,7 @@ class SACAux(SAC):
                 losses[name][step] = value
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/aux_skipped", self._n_aux_skipped)
+        self.logger.record("train/reward_scale", self._reward_scale)
         for name, values in losses.items():
             if name != "largest_reward":
                 self.logger.record(f"train/{name}", sum(values.values()) / len(values))
@@ -559,6 +563,7 @@ class SACAux(SAC):
     ) -> None:
         """
         As in SB3. Parameters of an auxiliary loss whose shapes are not those of this model's are left out, with a warning.
+        The unit of rewards under batch norm (``train/reward_scale``) is no parameter: :meth:`load` keeps it.
         """
         given: Any = load_path_or_dict
         if not isinstance(given, dict):

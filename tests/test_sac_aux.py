@@ -502,7 +502,7 @@ def test_logs() -> None:
     model = filled_model()
     model.train(4, batch_size=16)
     logged = model.logger.name_to_value
-    names = "aux_loss aux_skipped n_updates ent_coef ent_coef_loss critic_loss actor_loss learning_rate"
+    names = "aux_loss aux_skipped reward_scale n_updates ent_coef ent_coef_loss critic_loss actor_loss learning_rate"
     assert {f"train/{name}" for name in names.split()} == set(logged) - {name for name in logged if "train/" not in name}
     model.train(1, batch_size=16)
     assert logged["train/aux_loss"] > 0 and logged["train/aux_skipped"] == 0
