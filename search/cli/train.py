@@ -30,7 +30,8 @@ def train(
         typer.Option(help=f"Hyper-parameters: {SHIPPED}. Default: sac_aux, SACAux's own."),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(help="Environment steps (agent steps x action repeat). Default: the file's n_timesteps.")
+        int | None,
+        typer.Option(help="Environment steps (agent steps x action repeat). Default: the file's n_timesteps.", min=1),
     ] = None,
     evaluations: Annotated[int, typer.Option(help="Number of evaluations, equally spaced.", min=1)] = 5,
     episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.", min=1)] = 10,
