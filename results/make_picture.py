@@ -6,7 +6,7 @@ import pandas as pd
 from paper_figures import learning_curves_plot, read_curves
 
 RESULTS = Path(__file__).parent
-VARIANTS = {"sac_aux": "SACAux", "n_steps_3": "SACAux, n_steps=3"}
+VARIANTS = {"sac_aux": "SACAux"}
 # Means, read on 2026-11-27: of DR.Q at 50,000 and 100,000 environment steps (10 seeds; github.com/dmksjfl/DR.Q,
 # results/drq.csv), and of SAC in CrossQ's code at 100,000 (2 to 10 seeds; github.com/DAVIAN-Robotics/SimbaV2,
 # results/baseline/sac.csv). Both make one update a step.
