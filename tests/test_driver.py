@@ -340,3 +340,11 @@ def test_enqueued_losses_are_trained_and_invalid_ones_cost_nothing(tmp_path: Pat
     assert invalid.state == TrialState.PRUNED and "curve" not in invalid.user_attrs
     assert (loss_of(enqueued), enqueued.state) == (loss, TrialState.COMPLETE)
     assert len(outcome(search)) == 7 + 6 + 6
+
+
+def test_another_error_of_make_runs_ends_the_search_and_costs_no_candidate(tmp_path: Path) -> None:
+    search = start(tmp_path, Executor())
+    search.make_runs = lambda trial: int("a bug")
+    with pytest.raises(ValueError, match="a bug"):
+        list(search)
+    assert [trial.user_attrs.get("interrupted") for trial in search.study.trials] == [True]

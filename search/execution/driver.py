@@ -14,7 +14,7 @@ import numpy as np
 import optuna
 from optuna.storages import BaseStorage
 from optuna.trial import TrialState
-from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
+from sb3_aarl.search.evolution.sampler import FIXED_KEY, AuxLossSampler, GenerationProgress
 from sb3_aarl.search.evolution.space import described, loss_of, other_params
 from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.matrix import scaled, task_folder
@@ -145,7 +145,10 @@ class Driver:
             logger.warning("Trial %d: %s", trial.number, problem)
             self._tell(trial, state=TrialState.PRUNED)
             return
-        except ValueError as problem:  # so is what is searched beside the loss, which Optuna refuses
+        except ValueError as problem:
+            if FIXED_KEY not in self.study.get_trials(deepcopy=False)[trial.number].system_attrs:
+                raise
+            # Enqueued too, beside the loss, and Optuna refuses it.
             self._fail(trial, str(problem))
             return
         about = {"loss": runs[0].aux_loss, "threads": runs[0].threads, "commit": commit(), "versions": versions()}
