@@ -9,7 +9,7 @@ from matplotlib.patches import FancyBboxPatch
 # What is drawn at a point: its name, what is known of it (of the three lowest the class), its width and its colour.
 BOXES = {
     "actor_loss": (1.05, 5.85, "actor loss", "each third step", 1.8, "#ffffff"),
-    "critic_loss": (3.05, 5.85, "critic loss", "3-step returns", 1.8, "#ffffff"),
+    "critic_loss": (3.05, 5.85, "critic loss", "1-step returns", 1.8, "#ffffff"),
     "aux_loss": (5.05, 5.85, "auxiliary loss", "AuxLoss", 1.8, "#ffffff"),
     "actor": (1.05, 4.15, "actor", "Actor", 1.8, "#fbe3c6"),
     "critic": (3.05, 4.15, "Q networks", "Critic: batch norm", 1.8, "#cfe3f7"),
