@@ -9,6 +9,7 @@ curves: learning curves (9).
 
 import argparse
 import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -162,7 +163,12 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+", help="folders of searches; of rankings, patterns and curves one")
     parser.add_argument("--out", type=Path, help="default: KIND.png in the first folder")
     arguments = parser.parse_args()
-    figure = learning_curves_plot(read_curves(arguments.folders[0])) if arguments.kind == "curves" else of_searches(arguments)
+    try:
+        figure = (
+            learning_curves_plot(read_curves(arguments.folders[0])) if arguments.kind == "curves" else of_searches(arguments)
+        )
+    except ValueError as error:  # nothing is there
+        sys.exit(str(error))
     out = arguments.out or arguments.folders[0] / f"{arguments.kind}.png"
     figure.savefig(out)
     print(f"Figure: {out}")

@@ -120,12 +120,19 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?", default=Path("runs/benchmark"), help="folder of a benchmark")
     parser.add_argument("--table", type=int, choices=list(tables()), help="default: the one with most of the variants")
     arguments = parser.parse_args()
-    runs = read_runs(arguments.folder)
+    try:
+        runs = read_runs(arguments.folder)
+    except ValueError as error:
+        sys.exit(str(error))
     number = arguments.table or closest_table(runs["variant"])
     if number is None:
         sys.exit(f"no table of the paper has a variant of {arguments.folder}")
+    found = beside(runs, number)
+    if found.empty:
+        steps = ", ".join(f"{steps:,}" for steps in tables()[number]["scores"])
+        sys.exit(f"{arguments.folder} has no finished run to compare with table {number}, which has returns at {steps} steps")
     print(f"Table {number} of the paper; ▲ ▼: more than two standard errors of the difference from it")
-    print(readable(beside(runs, number)).to_string(index=False))
+    print(readable(found).to_string(index=False))
 
 
 if __name__ == "__main__":

@@ -461,7 +461,7 @@ def test_a_run_too_short_to_learn_is_said_before_it_starts(caplog: pytest.LogCap
     check_run(make_run(hyperparameters=DENSE | {"learning_starts": 64}), "own.yml")
     check_run(make_run(hyperparameters=DENSE | {"learning_starts": 63}), "own.yml")
     assert [record.getMessage() for record in caplog.records] == [
-        "all 64 agent steps are random actions, and nothing is learnt: learning_starts is 64"
+        "Walk-v0: all 64 agent steps are random actions, and nothing is learnt: learning_starts is 64"
     ]
 
 

@@ -194,10 +194,16 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     cluster.shutdown()
 
 
-def test_a_ray_node_is_removed(tmp_path: Path, undisturbed: Slots, cluster: Any) -> None:
+def test_a_ray_node_is_removed(
+    tmp_path: Path, undisturbed: Slots, cluster: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user's module is in the driver's folder; nodes were started in another."""
     from sb3_aarl.search.execution.ray import RayExecutor
 
-    search, removed = Search.from_file(write_search(tmp_path, FIRST), tmp_path / "runs/small"), False
+    monkeypatch.chdir(tmp_path)
+    Path("of_the_driver.py").touch()
+    config = write_search(tmp_path, FIRST + "imports: [of_the_driver]\n")
+    search, removed = Search.from_file(config, tmp_path / "runs/small"), False
 
     def remove(progress: SearchProgress) -> None:
         nonlocal removed

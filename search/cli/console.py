@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
+from rich.progress import track
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -84,12 +85,12 @@ def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
     from sb3_aarl.search.training.setup import measure
 
     table, n_all, hours_of_all = Table("", "runs", "hours of each", "core hours"), 0, 0.0
-    for name, runs in kinds.items():
+    for name, runs in track(kinds.items(), "Measuring", console=errors, transient=True):
         hours = measure(runs[0])
         n_all, hours_of_all = n_all + len(runs), hours_of_all + len(runs) * hours
         table.add_row(name, str(len(runs)), f"{hours:.2g}", f"{len(runs) * hours * runs[0].threads:.2g}")
     console.print(table)
     at_once = max(1, min(workers, n_all))
     say(
-        f"All: {n_all} runs, {hours_of_all / at_once:.2g} hours with --workers {workers}, beside evaluations. Nothing started."
+        f"All: {n_all} runs, {hours_of_all / at_once:.2g} hours if {workers} run at once, beside evaluations. Nothing started."
     )

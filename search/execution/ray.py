@@ -3,6 +3,7 @@
 import socket
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import Any
 
 import ray
@@ -35,9 +36,12 @@ class RayExecutor(AbstractContextManager["RayExecutor"]):
     def __init__(self, address: str | None = None, cpus: float = 1, gpus: float = 0):
         if address and address != "auto" and "://" not in address:
             check_address(address)
+        # A user's own modules are found on all nodes, whose Ray was started in another folder.
+        environment = {"env_vars": {"PYTHONPATH": f"{Path.cwd()}:${{PYTHONPATH}}"}}
+        dashboard = False if address is None else None
         try:
             # "local" starts a new Ray also where RAY_ADDRESS names another one.
-            ray.init(address=address or "local", log_to_driver=False, include_dashboard=False if address is None else None)
+            ray.init(address or "local", runtime_env=environment, log_to_driver=False, include_dashboard=dashboard)
         except ConnectionError as error:  # Ray's advice names options that are not ours
             raise ConnectionError(f"--ray-address {address}: {str(error).partition('. ')[0]}") from error
         # Ray would repeat a task on its own, and keep a worker's memory for the next one.

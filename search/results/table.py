@@ -44,7 +44,7 @@ def read_runs(folder: Path) -> pd.DataFrame:
             cell = (about["variant"], about["environment"], about["seed"])
             rows.append((*cell, checkpoint, math.nan if reason else mean, reason, *settings))
     if not rows:
-        raise ValueError(f"{folder} has no runs of a benchmark")
+        raise ValueError(f"{folder} has no runs of a benchmark. aarl benchmark trains them")
     return pd.DataFrame(rows, columns=RUN_COLUMNS)
 
 

@@ -91,11 +91,14 @@ def load_benchmark(
         variant's ``n_timesteps``
     :param names: The variants to train. Default: all in the files
     """
-    variants = [variant for file in files for variant in read_variants(file) if variant.name in names or not names]
+    variants = [variant for file in files for variant in read_variants(file)]
     found = [variant.name for variant in variants]
-    for name in (*names, *found):
+    for name in names or found:
         if found.count(name) != 1:
-            raise ConfigError(f"{'two variants are' if name in found else 'no variant is'} called {name}")
+            raise ConfigError(
+                f"two variants are called {name}" if name in found else f"no variant is called {name}: {', '.join(found)}"
+            )
+    variants = [variant for variant in variants if variant.name in names or not names]
     import_modules(imports)
     ids = list(dict.fromkeys(map(resolve_env_id, environments or _common_environments(variants))))
     # SACAux's default, written out: a variant that names no loss is not one that says "none".

@@ -157,14 +157,14 @@ def check_run(run: Run, source: str | None = None) -> Setup:
         problem = f"have {setup.episode_steps} environment steps, the horizon of {model.aux_loss} {horizon}"
         raise ConfigError(f"{what}: episodes {problem}")
     if setup.agent_steps <= learning_starts:
-        message = "all %d agent steps are random actions, and nothing is learnt: learning_starts is %d"
-        logger.warning(message, setup.agent_steps, learning_starts)
+        message = "%s: all %d agent steps are random actions, and nothing is learnt: learning_starts is %d"
+        logger.warning(message, run.environment, setup.agent_steps, learning_starts)
     interval = min(after - before for before, after in zip((0, *run.checkpoints), run.checkpoints, strict=False))
     if setup.episode_steps is None:
         logger.warning("%s has no time limit: an evaluation may take very long", run.environment)
     elif interval < setup.episode_steps * setup.n_envs:
-        message = "evaluations every %d environment steps truncate episodes, which have up to %d steps"
-        logger.warning(message, interval // setup.n_envs, setup.episode_steps)
+        message = "%s: evaluations every %d environment steps truncate episodes, which have up to %d steps"
+        logger.warning(message, run.environment, interval // setup.n_envs, setup.episode_steps)
     return setup
 
 
@@ -195,7 +195,7 @@ def measure(run: Run) -> float:
     setup = Setup(run, run.environment)
     with closing(setup.training_env()) as env:
         model = setup.model(env)
-        n_steps = setup.agent_steps - model.learning_starts
+        n_steps = max(0, setup.agent_steps - model.learning_starts)
         try_out(model)  # the first of everything is slow
         started = time.monotonic()
         model.learn(10**9, lambda *_: time.monotonic() - started < MEASURED_SECONDS)  # type: ignore[arg-type]

@@ -21,6 +21,7 @@ def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path
     by_name = {file.stem: file for file in shipped} | whole
     name = path.as_posix().removesuffix(".yml")
     if name not in by_name:
-        nearest = difflib.get_close_matches(name, by_name, n=1) or list(whole)
-        raise ValueError(f"{path} is no file, nor the name of a shipped one, nearest: {', '.join(nearest)}")
+        nearest = difflib.get_close_matches(name, by_name, n=1)
+        hint = f", nearest: {nearest[0]}" if nearest else f": {', '.join(whole)}"
+        raise ValueError(f"{path} is no file, nor the name of a shipped one{hint}")
     return by_name[name]
