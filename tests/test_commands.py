@@ -160,7 +160,7 @@ def test_the_cost_of_a_search_is_known_before_it_starts(folder: Path, monkeypatc
     row = next(line for line in output.splitlines() if line.startswith("│ small"))
     # 2 random ones and a prior, then 3; two seeds.
     assert [float(cell) for cell in row.split("│")[2:5]] == [12, *(float(f"{n * measured['small']:.2g}") for n in (1, 12))]
-    assert f"All: 12 runs, {12 / 4 * measured['small']:.2g} hours if 4 run at once" in output
+    assert f"All: 12 runs, {12 / 4 * measured['small']:.2g} hours with 4 at once" in output
     assert not Path("runs").exists()
 
 

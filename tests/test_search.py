@@ -194,9 +194,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     cluster.shutdown()
 
 
-def test_a_ray_node_is_removed(
-    tmp_path: Path, undisturbed: Slots, cluster: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_ray_node_is_removed(tmp_path: Path, undisturbed: Slots, cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A user's module is in the driver's folder; nodes were started in another."""
     from sb3_aarl.search.execution.ray import RayExecutor
 

@@ -91,6 +91,4 @@ def show_costs(kinds: "Mapping[str, Sequence[Run]]", workers: int) -> None:
         table.add_row(name, str(len(runs)), f"{hours:.2g}", f"{len(runs) * hours * runs[0].threads:.2g}")
     console.print(table)
     at_once = max(1, min(workers, n_all))
-    say(
-        f"All: {n_all} runs, {hours_of_all / at_once:.2g} hours if {workers} run at once, beside evaluations. Nothing started."
-    )
+    say(f"All: {n_all} runs, {hours_of_all / at_once:.2g} hours with {workers} at once, beside evaluations. Nothing started.")
