@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import optuna
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
@@ -163,20 +164,21 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+", help="folders of searches; of rankings, patterns and curves one")
     parser.add_argument("--out", type=Path, help="default: KIND.png in the first folder")
     arguments = parser.parse_args()
+    is_benchmark, folders = arguments.kind == "curves", arguments.folders
     try:
-        figure = (
-            learning_curves_plot(read_curves(arguments.folders[0])) if arguments.kind == "curves" else of_searches(arguments)
+        found: Any = (
+            read_curves(folders[0]) if is_benchmark else [load_study(open_storage(path, create=False)) for path in folders]
         )
     except ValueError as error:  # nothing is there
         sys.exit(str(error))
+    figure = learning_curves_plot(found) if is_benchmark else of_searches(found, arguments)
     out = arguments.out or arguments.folders[0] / f"{arguments.kind}.png"
     figure.savefig(out)
     print(f"Figure: {out}")
 
 
-def of_searches(arguments: argparse.Namespace) -> Figure:
+def of_searches(studies: list[optuna.Study], arguments: argparse.Namespace) -> Figure:
     """A figure of the kinds that are drawn from folders of searches."""
-    studies = [load_study(open_storage(folder, create=False)) for folder in arguments.folders]
     tables = {study.study_name: analysis.trial_table(study.get_trials(deepcopy=False)) for study in studies}
     table = next(iter(tables.values()))
     if arguments.kind == "evolution":

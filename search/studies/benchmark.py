@@ -94,10 +94,10 @@ def load_benchmark(
     variants = [variant for file in files for variant in read_variants(file)]
     found = [variant.name for variant in variants]
     for name in names or found:
-        if found.count(name) != 1:
-            raise ConfigError(
-                f"two variants are called {name}" if name in found else f"no variant is called {name}: {', '.join(found)}"
-            )
+        if name not in found:
+            raise ConfigError(f"no variant is called {name}: {', '.join(found)}")
+        if found.count(name) > 1:
+            raise ConfigError(f"two variants are called {name}")
     variants = [variant for variant in variants if variant.name in names or not names]
     import_modules(imports)
     ids = list(dict.fromkeys(map(resolve_env_id, environments or _common_environments(variants))))

@@ -15,7 +15,8 @@ def main() -> None:
     for path in sorted(RUNS.glob("*/*/seed-*/curve.csv")):
         loss, task, seed = path.parent.parts[-3:]
         returns.setdefault(task, {}).setdefault(loss, {})[seed] = [evaluation.mean for evaluation in read_curve(path)]
-    for task, of_losses in returns.items():
+    for task, found in returns.items():
+        of_losses = {loss: seeds for loss, seeds in found.items() if len(seeds) == 2}  # the others are not finished
         values = np.array([list(of_seeds.values()) for of_seeds in of_losses.values()])  # losses, seeds, evaluations
         means = values.cumsum(axis=2) / np.arange(1, values.shape[2] + 1)
         fractions = 2 * means.mean(axis=1).var(axis=0, ddof=1) / means.var(axis=1, ddof=1).mean(axis=0)
