@@ -20,7 +20,7 @@ from sb3_aarl import AuxLoss, SACAux, catalog
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 SEARCHES = sorted((ZOO / "search").glob("*.yml"))
-OTHERS = {"cheetah_run_simba", "demo", "template"}
+OTHERS = {"cheetah_run_simba", "demo", "template", "three_tasks"}
 PAPER = [path for path in SEARCHES if not path.stem.endswith("-small") and path.stem not in OTHERS]
 
 CONFIG: dict[str, Any] = {
