@@ -536,7 +536,7 @@ class SACAux(SAC):
         Neither the replay buffer, nor the environment, nor random generators are part of it.
         """
         tensors = {name: getattr(self, name).detach() for name in self._get_torch_save_params()[1]}
-        names = ("num_timesteps", "_n_updates", "_n_aux_skipped", "_episode_num", "_reward_scale")
+        names = ("num_timesteps", "learning_starts", "_n_updates", "_n_aux_skipped", "_episode_num", "_reward_scale")
         counters = {name: getattr(self, name) for name in names}
         state = {"parameters": self.get_parameters(), "tensors": tensors, "counters": counters}
         return copy.deepcopy({**state, "q_value_check": vars(self._q_value_check)})

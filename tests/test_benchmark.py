@@ -101,6 +101,7 @@ BETWEEN = r"multiples of 4 \(.*action repeat\), "
         ("mine.yml other/mine.yml", {}, "two variants are called mine"),
         ("mine.yml missing.yml", {}, "missing.yml: cannot be read: No such file"),
         ("mine.yml default.yml", {}, "no entry of one environment in common: name environments"),
+        ("empty.yml", {}, "empty.yml: variants: .*at least 1 item"),
         ("mine.yml", {"environments": ["Pendulm-v1"]}, "unknown environment 'Pendulm-v1'.*nearest: Pendulum-v1"),
         ("mine.yml", {"environments": ["Hopper-v5"]}, "mine.yml: neither 'Hopper-v5' nor 'default' is there"),
         ("default.yml", {"environments": ["CartPole-v1"]}, "CartPole-v1 cannot be trained .*Discrete"),
@@ -113,6 +114,7 @@ def test_what_cannot_be_trained_is_refused(names: str, options: dict[str, Any], 
     (folder / "other").mkdir()
     (folder / "other" / "mine.yml").write_text(OWN)
     (folder / "default.yml").write_text("default: {env_kwargs: {action_repeat: 4}}\n")
+    (folder / "empty.yml").write_text("base: default.yml\nvariants: {}\n")
     with pytest.raises(ValueError, match=message):
         check_matrix(load(names, **options))
     assert not Path("out").exists()

@@ -172,6 +172,8 @@ def test_a_benchmark_costs_what_is_not_finished(folder: Path, executor: Planted)
     run("benchmark", *options, "--seeds", "0")
     assert "All: 2 runs" in run("benchmark", *options, "--seeds", "0-2", "--dry-run")
     assert "All: 0 runs" in run("benchmark", *options, "--seeds", "0", "--dry-run")
+    Path("bad.yml").write_text("default: {policy_kwargs: {nett_arch: [8]}}\n")
+    assert "nett_arch" in run("benchmark", "bad.yml", *options[1:-1], "bad", "--dry-run", code=2)
 
 
 def test_status_of_a_search_and_its_baselines(folder: Path, executor: Planted) -> None:

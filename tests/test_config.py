@@ -371,6 +371,14 @@ def test_an_environment_without_an_entry_is_named(tmp_path: Path) -> None:
         load_config(write(tmp_path, hyper={"default": 3}))
 
 
+def test_the_entry_of_a_task_has_its_id_or_its_short_name(tmp_path: Path) -> None:
+    for name in ("dm_control/cheetah-run-v0", "Cheetah-Run"):
+        config = load_config(
+            write(tmp_path, hyper={"default": {"gamma": 0.9, "tau": 0.1}, name: {"gamma": 0.5}, "other": None})
+        )
+        assert config.hyperparameters_for("dm_control/cheetah-run-v0") == {"gamma": 0.5, "tau": 0.1}
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [

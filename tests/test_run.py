@@ -189,6 +189,16 @@ def test_a_run_that_is_stopped_ends_at_once_and_is_promoted_later(tmp_path: Path
     assert not (tmp_path / "checkpoint.pt").exists()
 
 
+def test_a_promoted_run_does_not_begin_again_with_random_actions(tmp_path: Path) -> None:
+    settings = {key: value for key, value in DENSE.items() if key != "learning_starts"}
+    prepare_run(tmp_path, make_run(hyperparameters=settings, keep_model=True))
+    train(tmp_path, on_evaluation=lambda curve: (tmp_path / "stop").touch())
+    prepare_run(tmp_path, make_run(hyperparameters=settings, keep_model=True, checkpoints=(32, 64, 640)))
+    train(tmp_path)
+    model = SACAux.load(tmp_path / "model.zip")
+    assert model.learning_starts == 6 and model._n_updates == 640 - 6
+
+
 def test_a_candidate_that_fails_is_not_to_be_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Walk, "fault", lambda: float("nan"))
     prepare_run(tmp_path, make_run(checkpoints=(16, 64), evaluation_episodes=1))

@@ -195,6 +195,7 @@ def benchmark(
     execution = options.Execution(executor, ray_address, slurm, cpus_per_run, gpus_per_run)
 
     from sb3_aarl.search.cli.results import table
+    from sb3_aarl.search.execution.matrix import check_matrix
     from sb3_aarl.search.studies.benchmark import RUNS, VARIANTS, load_benchmark, parse_seeds, parse_steps
 
     names, wanted = ([name.strip() for name in text.split(",")] if text else [] for text in (envs, variants))
@@ -208,6 +209,7 @@ def benchmark(
         configs, names, parse_seeds(seeds), steps, between[0], episodes, threads, folder, modules(imports), wanted
     )
     if dry_run:
+        check_matrix(matrix)
         show_costs(unfinished(matrix), execution.at_once(workers, len(matrix.runs)))
         return
     train_matrix(matrix, execution, workers)

@@ -110,7 +110,7 @@ class Execution:
 
 def modules(imports: str) -> list[str]:
     """The modules that ``--imports`` names."""
-    return imports.split(",") if imports else []
+    return [name.strip() for name in imports.split(",")] if imports else []
 
 
 def search_folder(search: Path | None) -> Path | None:
@@ -118,7 +118,7 @@ def search_folder(search: Path | None) -> Path | None:
     if search is None:
         return None
     default = Path("runs") / search.stem
-    is_config = search.suffix.lower() in (".yml", ".yaml") or (not search.exists() and default.exists())
+    is_config = search.is_file() or search.suffix.lower() in (".yml", ".yaml") or (not search.exists() and default.exists())
     return default if is_config else search
 
 

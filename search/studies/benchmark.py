@@ -5,9 +5,9 @@ import re
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from sb3_aarl.search.execution.matrix import Cell, Matrix
 from sb3_aarl.search.training.config import (
     ConfigError,
@@ -43,7 +43,7 @@ class Experiment(BaseModel, extra="forbid"):
     """
 
     base: str | dict[str, Any]
-    variants: dict[str, dict[str, Any]]
+    variants: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
     runs: tuple[str, ...] = ()
 
 
@@ -65,7 +65,7 @@ def read_variants(path: Path) -> list[Variant]:
     base = experiment.base
     entries = read_yaml(find_file(Path(base), folder=path.parent)) if isinstance(base, str) else base
     return [
-        Variant(name, path, {env_id: merge(entry, changes) for env_id, entry in entries.items()}, f"{path}: {name}")
+        Variant(name, path, {env_id: merge(entry or {}, changes) for env_id, entry in entries.items()}, f"{path}: {name}")
         for name, changes in experiment.variants.items()
     ]
 

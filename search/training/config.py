@@ -34,7 +34,8 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     Read the hyper-parameters of an environment from a file like RL-Zoo's: arguments of SACAux, ``n_timesteps`` (agent steps),
     ``n_envs``, ``vec_env`` (``dummy`` or ``subproc``), ``env_kwargs`` (of ``make_dmc_env``, or of ``wrap_env`` for what is not
     DeepMind Control), ``env_wrapper`` (see :func:`env_wrappers`) and ``normalize`` (true, or arguments of ``VecNormalize``).
-    The environment's own entry is merged over the entry ``default``. Nothing in the file is evaluated.
+    The environment's own entry, which may be under a task's short name, is merged over the entry ``default``. Nothing in the
+    file is evaluated.
 
     :raises ConfigError: naming the file and the key that is wrong
     """
@@ -43,12 +44,14 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
 
 def entry_of(entries: Mapping[str, Any], env_id: str, source: str) -> dict[str, Any]:
     """The hyper-parameters of an environment in the contents of a file."""
-    if not {"default", env_id} & entries.keys():
+    is_dmc = env_id.startswith(PREFIX)
+    own = [name for name in entries if name == env_id or (is_dmc and find_task(name) == env_id)]
+    if not own and "default" not in entries:
         hint = ": it is the file of a search" if "environment" in entries else ", under which hyper-parameters are expected"
         raise ConfigError(f"{source}: neither {env_id!r} nor 'default' is there{hint}")
     merged: dict[str, Any] = {}
-    for name in ("default", env_id):
-        entry = entries.get(name, {})
+    for name in ("default", *own):
+        entry = {} if entries.get(name) is None else entries[name]
         if not isinstance(entry, dict):
             raise ConfigError(f"{source}: {name} must be a mapping, not {entry!r}")
         merged = merge(merged, entry)
@@ -72,7 +75,10 @@ def env_wrappers(value: Any) -> list[tuple[type[gym.Wrapper], dict[str, Any]]]:
     wrappers = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:
         ((name, arguments),) = item.items() if isinstance(item, Mapping) and len(item) == 1 else [(item, {})]
-        kind = pydoc.locate(str(name))
+        try:
+            kind = pydoc.locate(str(name))
+        except pydoc.ErrorDuringImport as error:  # no ValueError
+            raise ValueError(str(error)) from error
         if not (isinstance(kind, type) and issubclass(kind, gym.Wrapper) and isinstance(arguments, Mapping | None)):
             raise ValueError(f"must name a gymnasium.Wrapper that can be imported, or map one to its arguments, not {item!r}")
         wrappers.append((kind, dict(arguments or {})))
