@@ -14,6 +14,13 @@ from sb3_aarl.augmentation import image_spaces
 from sb3_aarl.networks import SimbaBlock, orthogonal_init
 
 
+def flatten(observations: th.Tensor | TensorDict) -> th.Tensor:
+    """Observations (batch, ...), or the parts of a Dict beside each other, as vectors (batch, numbers)."""
+    if isinstance(observations, dict):
+        return th.cat([flatten(part) for part in observations.values()], dim=1)
+    return observations.reshape(observations.shape[0], -1)
+
+
 class Encoder(BaseFeaturesExtractor, ABC):
     """
     An encoder in two parts: a trunk, and a projection (linear, layer norm) from it to the latent state.
@@ -100,8 +107,8 @@ class DenseMLP(Encoder):
         self.layers = nn.ModuleList(nn.Linear(size, width) for size in inputs[:-1]).apply(orthogonal_init)
         self.projection = self.make_projection()
 
-    def trunk(self, observations: th.Tensor) -> th.Tensor:
-        x = observations.reshape(observations.shape[0], -1)
+    def trunk(self, observations: th.Tensor | TensorDict) -> th.Tensor:
+        x = flatten(observations)
         for layer in self.layers:
             added = layer(x).relu()
             x = th.cat([x, added], dim=1) if self.dense else added
@@ -178,8 +185,8 @@ class SimbaEncoder(Encoder):
         # The observation needs none, and one of all of it would grow with its square.
         return nn.Identity() if self.observation else super().make_projection()
 
-    def trunk(self, observations: th.Tensor) -> th.Tensor:
-        x = self.normalization(observations.reshape(observations.shape[0], -1))
+    def trunk(self, observations: th.Tensor | TensorDict) -> th.Tensor:
+        x = self.normalization(flatten(observations))
         return th.cat([self.layers(x), x], dim=1) if self.observation else self.layers(x)
 
 
@@ -240,8 +247,7 @@ class MultiInputEncoder(Encoder):
     def _inputs(self, observations: TensorDict) -> list[th.Tensor]:
         inputs = [observations[key] for key in self.image_keys]
         if self.vector_keys:
-            parts = (observations[key] for key in self.vector_keys)
-            inputs.append(th.cat([part.reshape(part.shape[0], -1) for part in parts], dim=1))
+            inputs.append(flatten({key: observations[key] for key in self.vector_keys}))
         return inputs
 
     def trunk(self, observations: TensorDict) -> th.Tensor:  # type: ignore[override]

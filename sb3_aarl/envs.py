@@ -176,8 +176,11 @@ def wrap_env(env: gym.Env, *, pixels: bool = False, action_repeat: int = 1, fram
         channel_first = spaces.Box(0, 255, (channels, height, width), np.uint8)
         env = TransformObservation(env, lambda image: np.ascontiguousarray(image.transpose(2, 0, 1)), channel_first)
     if frame_stack > 1:
-        if not env.observation_space.shape:
-            raise ValueError(f"frame_stack is for vectors and images, not for {env.observation_space}")
-        first, *rest = env.observation_space.shape
-        env = ReshapeObservation(FrameStackObservation(env, frame_stack), (frame_stack * first, *rest))
+        space = env.observation_space
+        if not space.shape:
+            raise ValueError(f"frame_stack is for vectors and images, not for {space}")
+        first, *rest = space.shape
+        env = FrameStackObservation(env, frame_stack)
+        if len(rest) != 1 or space.dtype != np.uint8:  # a grey image has no channels: its frames are
+            env = ReshapeObservation(env, (frame_stack * first, *rest))
     return env

@@ -313,7 +313,8 @@ class SACAux(SAC):
                 batch, windows = self._sample(batch_size)
                 if self._n_updates == 1 and self.critic.norm == "batch":
                     # The mean of a batch norm's outputs moves slowly: rewards of 10 and more would take thousands of steps.
-                    self._reward_scale = max(1.0, batch.rewards.abs().mean().item() / self.n_steps)
+                    n_steps = getattr(self.replay_buffer, "n_steps", 1)  # an SB3 buffer may have its own, or none
+                    self._reward_scale = max(1.0, batch.rewards.abs().mean().item() / n_steps)
                 batch = batch._replace(rewards=batch.rewards / self._reward_scale)
                 log("largest_reward", batch.rewards.abs().max())
                 if self.use_sde:

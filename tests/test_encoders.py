@@ -136,6 +136,15 @@ def test_mlps_against_a_naive_forward_pass(cls: type[DenseMLP], shape: tuple[int
     np.testing.assert_allclose(encoder(observations).detach(), expected, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("kind", [DenseMLP, MLP, SimbaEncoder])
+def test_a_dict_is_read_as_one_vector(kind: type[DenseMLP]) -> None:
+    space = spaces.Dict(a=vectors(2, 3), b=vectors(4))
+    encoder, flat = kind(space).eval(), kind(vectors(10)).eval()
+    flat.load_state_dict(encoder.state_dict())
+    x = th.randn(5, 10)
+    th.testing.assert_close(encoder({"a": x[:, :6].reshape(5, 2, 3), "b": x[:, 6:]}), flat(x))
+
+
 @pytest.mark.parametrize(
     "keys",
     [["camera", "vectors", "speed", "mode", "joints"], ["camera"], ["speed", "joints"]],

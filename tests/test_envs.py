@@ -166,6 +166,8 @@ def test_images_are_stacked_along_their_channels() -> None:
     env = wrap_env(Image(gym.make("Pendulum-v1")), frame_stack=2)
     assert env.observation_space == spaces.Box(0, 255, (6, 40, 40), np.uint8)
     np.testing.assert_array_equal(env.reset()[0][:, 7, 9], [0, 1, 2, 0, 1, 2])
+    grey = gym.wrappers.GrayscaleObservation(Image(gym.make("Pendulum-v1")))
+    assert wrap_env(grey, frame_stack=2).observation_space == spaces.Box(0, 255, (2, 40, 40), np.uint8)
     with pytest.raises(ValueError, match="frame_stack is for vectors and images, not for Discrete"):
         wrap_env(gym.make("FrozenLake-v1"), frame_stack=2)
 
