@@ -111,8 +111,6 @@ def resolve_augmentation(
     if augmentation == "auto":
         augmentation = "random_shift" if crop_size is None else "random_crop"
     if augmentation != "random_crop":
-        if crop_size is not None:
-            raise ValueError(f"crop_size is for augmentation='random_crop', not for {augmentation!r}")
         return augmentation, None
     crop_size = CROP_SIZE if crop_size is None else crop_size
     for key, size in sizes.items():

@@ -243,7 +243,7 @@ class SACAuxPolicy(SACPolicy):
     :param augmentation: What training does to images: ``"random_shift"`` by up to 4 pixels (DrQ), ``"random_crop"`` to
         ``crop_size`` with a centre crop elsewhere (CURL, paper), ``"none"``, or ``"auto"``: crop where ``crop_size`` is
         given, else shift. Vectors are never augmented
-    :param crop_size: Height and width in pixels of cropped images, None for 84 (paper, table 7)
+    :param crop_size: Height and width in pixels of cropped images, of ``"random_crop"`` alone; None for 84 (paper, table 7)
     :param squash_log_std: None (default, SB3): the log standard deviation is clipped to [-20, 2]. Bounds such as
         (-10, 2) (the public reference): tanh squashes it into them; gSDE ignores them
     :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases

@@ -363,15 +363,12 @@ def test_a_missing_key_is_named(tmp_path: Path, key: str) -> None:
         load_config(path)
 
 
-def test_an_environment_without_an_entry_is_named(tmp_path: Path) -> None:
+def test_the_entry_of_an_environment_may_have_its_short_name_and_is_missed(tmp_path: Path) -> None:
     path = write(tmp_path, hyper={"Pendulum-v1": {}})
     with pytest.raises(ConfigError, match=r"hyper.yml: neither 'dm_control/cheetah-run-v0' nor 'default'"):
         load_config(path)
     with pytest.raises(ConfigError, match=r"hyper.yml: default must be a mapping"):
         load_config(write(tmp_path, hyper={"default": 3}))
-
-
-def test_the_entry_of_a_task_has_its_id_or_its_short_name(tmp_path: Path) -> None:
     for name in ("dm_control/cheetah-run-v0", "Cheetah-Run"):
         config = load_config(
             write(tmp_path, hyper={"default": {"gamma": 0.9, "tau": 0.1}, name: {"gamma": 0.5}, "other": None})

@@ -190,7 +190,7 @@ def test_with_encoders_of_their_own_is_sac(kind: str) -> None:
         "features_extractor_class": extractor,
         "optimizer_kwargs": {"fused": False, "betas": (0.9, 0.999)},
     }
-    own = {"share_features_extractor": False, "augmentation": "none", "crop_size": None}
+    own = {"share_features_extractor": False, "augmentation": "none"}
     settings = {"aux_kwargs": {"tau": 0.02}, "policy_kwargs": own}
     sac, ours = sac_and_ours(POLICIES[kind], lambda: make_env(kind), 60, settings, policy_kwargs=policy_kwargs)
     assert ours._n_updates == sac._n_updates == 50
@@ -772,7 +772,7 @@ def test_prediction_sees_the_centre_and_training_sees_any_crop(kind: str) -> Non
 
 @pytest.mark.parametrize("argument", [{"crop_size": 17}, {"augmentation": "random_shift"}, {"augmentation": "none"}])
 def test_augmentation_is_saved(argument: dict[str, Any], tmp_path: pathlib.Path) -> None:
-    model = make_model("pixels", policy_kwargs={"crop_size": None, **argument})
+    model = make_model("pixels", policy_kwargs=argument)
     model.save(tmp_path / "model")
     size = (17, 17) if "crop_size" in argument else (18, 20)
     for each in (model, SACAux.load(tmp_path / "model")):
@@ -808,7 +808,6 @@ def test_augmentation_is_saved(argument: dict[str, Any], tmp_path: pathlib.Path)
             "unknown critic_norm 'group', expected one of None, layer, batch",
         ),
         ("state", {"policy_kwargs": {"augmentation": "flip"}}, "unknown augmentation 'flip', expected one of auto"),
-        ("pixels", {"policy_kwargs": {"augmentation": "none"}}, "crop_size is for augmentation='random_crop', not for 'none'"),
         ("pixels", {"policy_kwargs": {"crop_size": 19}}, r"18 x 20 pixels are smaller than the crop of 19 x 19"),
         ("dict", {"policy_kwargs": {"crop_size": 19}}, r"under 'image' of 18 x 20 pixels are smaller"),
         ("pixels", {"replay_buffer_kwargs": {"frame_stack": 2}}, r"frame_stack=2 does not divide the first axis"),
