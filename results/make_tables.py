@@ -32,7 +32,12 @@ ROOT = RESULTS.parent
 SOURCE = "results/make_tables.py"
 # Pages that have some of the tables.
 GUIDES = ("expect.md", "from_sac.md", "losses.md", "paper.md", "results.md")
-PAGES = [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs" / "guides" / name for name in GUIDES)]
+PAGES = [
+    ROOT / "README.md",
+    RESULTS / "README.md",
+    RESULTS / "agent/proof/about.md",
+    *(ROOT / "docs" / "guides" / name for name in GUIDES),
+]
 # The columns of the main table, and their variants in agent/proof/runs.
 PROVED = {"SACAux": "sac_aux", "no loss": "no_loss", "SAC": "sac", "CrossQ": "crossq"}
 # What a search does to losses; the others are drawn at random, from priors, or given.
@@ -54,6 +59,7 @@ def texts() -> dict[Path, str]:
     read = yaml.safe_load((RESULTS / "tables.yml").read_text("utf-8"))
     tasks = [row for row in read["headline"].values() if isinstance(row[-1], int)]
     tables = {name: sentence(part, tasks) if isinstance(part, str) else readme_table(part) for name, part in read.items()}
+    tables["shares"] = shares_table(tasks)
     abouts = sorted(RESULTS.glob("*/*/about.md"))
     tables["index"] = markdown([("experiment", "question", "answer"), *map(summary, abouts)])
     files = {path: filled(path.read_text(encoding="utf-8"), tables) for path in PAGES}
@@ -87,7 +93,7 @@ def proof_row(name: str, values: list[str]) -> list[str]:
     """A row of the main table: our runs where there are some, else a published mean, else a dash."""
     if isinstance(values[-1], str):
         return [name, *values]
-    task, sac, crossq, best, _ = values
+    task, sac, crossq, best, *_ = values
     published = {"sac": sac, "crossq": crossq}
     folders = {variant: f"agent/proof/runs/{variant}/{task}" for variant in PROVED.values()}
     cells = [folder if (RESULTS / folder).exists() else published.get(variant, "-") for variant, folder in folders.items()]
@@ -100,13 +106,34 @@ def sentence(text: str, rows: Iterable[list[Any]]) -> str:
     the medians of the mean return over DR.Q's and over SAC's.
     """
     found = []
-    for task, sac, _, _, drq in rows:
+    for task, sac, _, _, drq, _ in rows:
         if last := last_returns(RESULTS / "agent/proof/runs/sac_aux" / task):
             mean = statistics.mean(last)
             found.append((mean / drq, mean / float(sac.strip("_").partition(" ")[0].replace(",", ""))))
     share, times = map(statistics.median, zip(*found, strict=True))
     text = text.format(tasks=len(found), share=f"{share:.2f}", times=f"{times:.1f}")
     return textwrap.fill(text, 126, break_on_hyphens=False)
+
+
+def shares_table(rows: Iterable[list[Any]]) -> str:
+    """The defaults beside DR.Q and MR.Q, and of each run the mean of the last two evaluations over the best before."""
+    table = [["task", "mean returns at each 10,000 environment steps", "last", "of DR.Q", "of MR.Q", "kept"]]
+    shares, kept = [], []
+    for task, *_, drq, mrq in rows:
+        folder = RESULTS / "agent/proof/runs/sac_aux" / task
+        curves = [[point.mean for point in read_curve(path)] for path in sorted(folder.glob("seed-*/curve.csv"))]
+        means = [statistics.mean(values) for values in zip(*curves, strict=True)]
+        ratios = [statistics.mean(curve[-2:]) / max(curve[:-2]) for curve in curves]
+        shares.append([means[-1] / drq, means[-1] / mrq])
+        kept += ratios
+        numbers = [", ".join(f"{mean:,.0f}" for mean in means), returns(folder), *(f"{share:.2f}" for share in shares[-1])]
+        table.append([task, *numbers, ", ".join(f"{ratio:.2f}" for ratio in ratios)])
+    lines = [
+        f"{name} {of([drq for drq, _ in shares]):.2f} of DR.Q and {of([mrq for _, mrq in shares]):.2f} of MR.Q"
+        for name, of in (("Mean share", statistics.mean), ("median", statistics.median))
+    ]
+    text = f"{'; '.join(lines)}. At least 0.8 is kept in {sum(ratio >= 0.8 for ratio in kept)} of {len(kept)} runs."
+    return f"{markdown(table)}\n\n{text}"
 
 
 def last_returns(folder: Path) -> list[float]:
