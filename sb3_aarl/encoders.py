@@ -15,9 +15,9 @@ from sb3_aarl.networks import SimbaBlock, orthogonal_init
 
 
 def flatten(observations: th.Tensor | TensorDict) -> th.Tensor:
-    """Observations (batch, ...), or the parts of a Dict beside each other, as vectors (batch, numbers)."""
+    """Observations (batch, ...), or the parts of a Dict in the order of their names, as vectors (batch, numbers)."""
     if isinstance(observations, dict):
-        return th.cat([flatten(part) for part in observations.values()], dim=1)
+        return th.cat([flatten(observations[key]) for key in sorted(observations)], dim=1)
     return observations.reshape(observations.shape[0], -1)
 
 

@@ -157,8 +157,8 @@ def detect_frame_stack(env: VecEnv) -> int | dict[str, int]:
     else:
         try:
             stack = env.get_attr("stack_size")[0] if all(env.env_is_wrapped(FrameStackObservation)) else 1
-        except (NotImplementedError, AttributeError):
-            stack = 1  # env_is_wrapped is abstract in SB3, and VecEnvs of other packages do not all have it
+        except (NotImplementedError, AttributeError, TypeError):
+            stack = 1  # VecEnvs of other packages do not all have env_is_wrapped, or answer with None or one bool
     stacks = dict.fromkeys(parts, 1)
     for key, part in parts.items():
         shape = part.shape or (1,)

@@ -65,7 +65,7 @@ class SACAux(SAC):
         two have their own
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts; None (default, until ``learn``) for 5,000,
-        or a tenth of each ``learn`` if that is less
+        or a tenth of each ``learn`` if that is less. A model that goes on without its replay buffer waits as long
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 1 copies them at each update (no targets, as in CrossQ); 0 freezes
         the target critic's weights
@@ -185,6 +185,7 @@ class SACAux(SAC):
         self._n_aux_skipped = 0
         self._reward_scale = 1.0  # by which rewards are divided
         self._q_value_check = QValueCheck()
+        self._waits_until = -1  # the agent step from which a model learns that was loaded without its buffer
         self._stored_timesteps = 0  # steps whose transitions are in the buffer
         self._default_learning_starts: int | None = None  # which the last learn() has set
         self._frame_stack: int | dict[str, int] = 1  # as detected; saved, since load() may have no wrappers to look at
@@ -229,6 +230,8 @@ class SACAux(SAC):
     def _setup_replay_buffer(self, buffer_class: type[WindowReplayBuffer]) -> None:
         if self.env is not None:
             self._frame_stack = detect_frame_stack(self.env)
+        if self.replay_buffer is not None:
+            return  # load() was given one, or found it in the file
         returns = {"n_steps": self.n_steps, "gamma": self.gamma} if self.n_steps > 1 else {}
         kwargs = {"frame_stack": self._frame_stack, **returns, **(self.replay_buffer_kwargs or {})}
         space, actions, n_envs = self.observation_space, self.action_space, self.n_envs
@@ -292,14 +295,16 @@ class SACAux(SAC):
         return self.lr_schedule if self._aux.learning_rate is None else FloatSchedule(self._aux.learning_rate)
 
     def _update_learning_rates(self) -> None:
-        optimizers = [self.actor.optimizer, self.critic.optimizer]
-        if self.ent_coef_optimizer is not None and "lr" not in (self.ent_coef_optimizer_kwargs or {}):
-            optimizers.append(self.ent_coef_optimizer)
-        self._update_learning_rate(optimizers)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        if self.ent_coef_optimizer is not None:
+            rate = self.lr_schedule(self._current_progress_remaining)
+            update_learning_rate(self.ent_coef_optimizer, (self.ent_coef_optimizer_kwargs or {}).get("lr", rate))
         if self.aux_optimizer is not None:
             update_learning_rate(self.aux_optimizer, self._aux_schedule(self._current_progress_remaining))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        if self.num_timesteps <= self._waits_until:
+            return
         # Batch norm and dropout of the networks that learn.
         self.policy.set_training_mode(True)
         self._update_learning_rates()
@@ -368,6 +373,7 @@ class SACAux(SAC):
                     self._update_target()
                 # Running statistics of the encoder are copied, see SB3's issue 996.
                 polyak_update(self.critic.running_statistics, self.critic_target.running_statistics, 1.0)
+        self.policy.set_training_mode(False)  # whoever reads Q values between steps changes no running statistics
 
     def _act(self, observations: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
         """Actions of the actor and their log probabilities, (batch, action_dim) and (batch, 1)."""
@@ -511,6 +517,14 @@ class SACAux(SAC):
         if self.learning_starts in (None, self._default_learning_starts):
             before = 0 if reset_num_timesteps else self.num_timesteps
             self.learning_starts = self._default_learning_starts = default_learning_starts(before + total_timesteps)
+        if reset_num_timesteps:
+            self._waits_until = -1
+        elif self._n_updates and self.critic.norm == "batch" and not self.replay_buffer.size():  # type: ignore[union-attr]
+            # Batch norm would forget what it knows for a few equal transitions.
+            self._waits_until = self.num_timesteps + self.learning_starts
+            logger.warning(
+                "the replay buffer is empty (load_replay_buffer): learning waits for %d steps", self.learning_starts
+            )
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if self._n_updates and self._n_aux_skipped == self._n_updates:
             warnings.warn(f"aux_loss was never trained: no episode is as long as its horizon ({self.aux_loss})", stacklevel=2)

@@ -672,6 +672,13 @@ def small(algorithm: type[SAC], env: Any, **kwargs: Any) -> SAC:
     return algorithm(policy, env, device="cpu", **kwargs)
 
 
+class Foreign(DummyVecEnv):
+    """As VecEnvs of other packages may answer."""
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> Any:
+        return False
+
+
 def image_env(n_frames: int = 1) -> gym.Env:
     env: gym.Env = Shown(IMAGE)
     if n_frames > 1:
@@ -696,6 +703,7 @@ BOTH = spaces.Dict({"image": IMAGE, "state": VECTOR, "table": TABLE})
     "make_env, expected",
     [
         (lambda: DummyVecEnv([lambda: Shown(VECTOR)]), 1),
+        (lambda: Foreign([lambda: Shown(VECTOR)]), 1),
         (lambda: VecTransposeImage(DummyVecEnv([image_env])), 1),
         (lambda: VecTransposeImage(DummyVecEnv([lambda: image_env(4)] * 2)), 4),
         (lambda: VecTransposeImage(VecFrameStack(DummyVecEnv([image_env] * 2), 3)), 3),

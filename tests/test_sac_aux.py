@@ -473,13 +473,16 @@ def test_which_loss_moves_the_encoder(kind: str, joint: bool) -> None:
     assert moved(1e-3, 0.0, aux_loss=None) == {"encoder", "q", "actor"}
 
 
-def test_learning_rates_and_coef(caplog: pytest.LogCaptureFixture) -> None:
+def test_learning_rates_and_coef(caplog: pytest.LogCaptureFixture, tmp_path: pathlib.Path) -> None:
     settings = {"learning_rate": 1e-3, "aux_kwargs": {"learning_rate": lambda left: 2e-3 * left}}
     model = make_model(ent_coef_optimizer_kwargs={"lr": 1e-2, "betas": (0.3, 0.99)}, **settings).learn(50)
     assert model.aux_optimizer.param_groups[0]["lr"] == pytest.approx(2e-3 * model._current_progress_remaining)
     assert model.ent_coef_optimizer.param_groups[0]["lr"] == 1e-2
     assert model.ent_coef_optimizer.param_groups[0]["betas"] == (0.3, 0.99)
     assert model.critic.optimizer.param_groups[0]["lr"] == 1e-3
+    model.save(tmp_path / "model")
+    loaded = SACAux.load(tmp_path / "model", make_env("state"), ent_coef_optimizer_kwargs={"lr": 1e-5}).learn(50)
+    assert loaded.ent_coef_optimizer.param_groups[0]["lr"] == 1e-5
     make_model(ent_coef=0.1, ent_coef_optimizer_kwargs={"lr": 1e-2})
     assert "ent_coef_optimizer_kwargs have no effect: ent_coef=0.1 is fixed" in caplog.text
     model = make_model(learning_rate=lambda left: 1e-3 + left).learn(10)
@@ -725,6 +728,19 @@ def test_learning_continues_after_it_was_stopped(kind: str, by: str) -> None:
     before = model._n_updates
     model.learn(20, reset_num_timesteps=False)
     assert model._n_updates == before + 20 and model.replay_buffer.size() == 46
+
+
+@pytest.mark.parametrize("norm", ["batch", None])
+def test_learning_waits_for_the_buffer_that_load_has_not(norm: str | None, tmp_path: pathlib.Path, caplog: Any) -> None:
+    model = make_model(learning_starts=20, policy_kwargs={"critic_norm": norm}).learn(40)
+    model.save(tmp_path / "model", include=["replay_buffer"])
+    loaded = SACAux.load(tmp_path / "model", make_env("state"), replay_buffer=None)
+    loaded.learn(15, reset_num_timesteps=False)
+    assert loaded._n_updates == 20 + 15 * (norm is None)
+    assert ("learning waits for 20 steps" in caplog.text) == (norm == "batch")
+    assert loaded.learn(15, reset_num_timesteps=False)._n_updates == (30 if norm == "batch" else 50)
+    kept = SACAux.load(tmp_path / "model", make_env("state"))
+    assert kept.replay_buffer.size() == 40 and kept.learn(5, reset_num_timesteps=False)._n_updates == 25
 
 
 # --- Seeds and prediction ----------------------------------------------------------------------------------------------
