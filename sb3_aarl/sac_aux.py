@@ -65,7 +65,7 @@ class SACAux(SAC):
         two have their own
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts; None (default, until ``learn``) for 5,000,
-        or a tenth of each ``learn`` if that is less. A model that goes on without its replay buffer waits as long
+        or a tenth of each ``learn`` if that is less. A model that goes on without its replay buffer begins with as many
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 1 copies them at each update (no targets, as in CrossQ); 0 freezes
         the target critic's weights
@@ -185,7 +185,7 @@ class SACAux(SAC):
         self._n_aux_skipped = 0
         self._reward_scale = 1.0  # by which rewards are divided
         self._q_value_check = QValueCheck()
-        self._waits_until = -1  # the agent step from which a model learns that was loaded without its buffer
+        self._random_until = -1  # the last random agent step of a model that was loaded without its buffer
         self._stored_timesteps = 0  # steps whose transitions are in the buffer
         self._default_learning_starts: int | None = None  # which the last learn() has set
         self._frame_stack: int | dict[str, int] = 1  # as detected; saved, since load() may have no wrappers to look at
@@ -303,7 +303,7 @@ class SACAux(SAC):
             update_learning_rate(self.aux_optimizer, self._aux_schedule(self._current_progress_remaining))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        if self.num_timesteps <= self._waits_until:
+        if self.num_timesteps <= self._random_until:
             return
         # Batch norm and dropout of the networks that learn.
         self.policy.set_training_mode(True)
@@ -518,21 +518,19 @@ class SACAux(SAC):
             before = 0 if reset_num_timesteps else self.num_timesteps
             self.learning_starts = self._default_learning_starts = default_learning_starts(before + total_timesteps)
         if reset_num_timesteps:
-            self._waits_until = -1
+            self._random_until = -1
         elif self._n_updates and self.critic.norm == "batch" and not self.replay_buffer.size():  # type: ignore[union-attr]
-            # Batch norm would forget what it knows for a few equal transitions.
-            self._waits_until = self.num_timesteps + self.learning_starts
-            logger.warning(
-                "the replay buffer is empty (load_replay_buffer): learning waits for %d steps", self.learning_starts
-            )
+            # Batch norm forgets what it knows on a few transitions, or on those of one policy.
+            self._random_until = self.num_timesteps + self.learning_starts
+            logger.warning("the replay buffer is empty (load_replay_buffer): %d random steps come first", self.learning_starts)
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if self._n_updates and self._n_aux_skipped == self._n_updates:
             warnings.warn(f"aux_loss was never trained: no episode is as long as its horizon ({self.aux_loss})", stacklevel=2)
         return self
 
-    def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
+    def _sample_action(self, learning_starts: int, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         with self._actor_checked():
-            return super()._sample_action(*args, **kwargs)
+            return super()._sample_action(max(learning_starts, self._random_until), *args, **kwargs)
 
     @contextmanager
     def _actor_checked(self) -> Iterator[None]:
