@@ -272,6 +272,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
         "cross_validation.returns: dm_control/walker-run-v0 is missing",
     ),
     (
+        {"cross_validation": {"environments": ["Pendulum-v1", "walker-run"], "returns": {"Pendulum-v1": [-1500, 0]}}},
+        "cross_validation.returns: dm_control/walker-run-v0 is missing",
+    ),
+    (
         {"cross_validation": {"environments": ["walker-run"], "checkpoints": {"Pendulum-v1": [4]}}},
         "cross_validation.checkpoints: Pendulum-v1 is none of its environments",
     ),

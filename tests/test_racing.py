@@ -76,6 +76,13 @@ def test_the_posterior_is_that_of_the_priors() -> None:
     )
 
 
+@given(st.lists(st.integers(-(10**6), 10**6), min_size=2, max_size=3, unique=True))
+def test_means_of_few_scores_lie_between_them_in_their_order(few: list[int]) -> None:
+    means = standings(np.array(few)[:, None]).mean
+    assert (np.argsort(means, kind="stable") == np.argsort(few, kind="stable")).all()
+    assert min(few) <= means.min() and means.max() <= max(few)
+
+
 def test_with_many_seeds_the_posterior_is_that_of_the_means() -> None:
     truth, rng = np.array([100.0, 103.0, 110.0]), np.random.default_rng(1)
     scores = truth[:, None] + 5 * rng.normal(size=(3, 400))

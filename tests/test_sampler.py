@@ -214,7 +214,8 @@ def test_initial_losses_are_the_first_slots() -> None:
     assert suggest_aux_loss(again, 2) not in drawn
     assert (key_of(again), again.user_attrs["operation"]) == ((1, 0, 1), "random")
     assert sampler_of(make_study(initial=losses, allow_duplicates=True)).operations(1).count("given") == 3
-    assert filled_slots(run(make_study(initial=losses, n_random=0, n_prior=0))) == all_slots(2, 12, 3)
+    named = make_study(initial=["forward-dynamics", *losses[1:]], n_random=0, n_prior=0)
+    assert filled_slots(run(named)) == all_slots(2, 12, 3)
 
 
 @pytest.mark.parametrize("screening", [1, 4])

@@ -18,10 +18,19 @@ from sb3_aarl.search.evolution.space import SEED_INDEX_KEY, distributions, loss_
 from sb3_aarl.search.evolution.surrogate import TokenModel
 from sb3_aarl.search.execution.driver import SearchProgress
 from sb3_aarl.search.execution.matrix import Cell, run_matrix, scores
+from sb3_aarl.search.execution.storage import driver_lock
 from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.studies import cross_validation
 from sb3_aarl.search.studies.config import SearchConfig, load_config
-from sb3_aarl.search.studies.search import SETTINGS_KEY, Search, baselines, make_pruner, planned_runs, runs_of
+from sb3_aarl.search.studies.search import (
+    SETTINGS_KEY,
+    Search,
+    baselines,
+    make_pruner,
+    planned_runs,
+    runs_of,
+    stored_settings,
+)
 from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError
 from tiny import SEARCH, write_search
@@ -115,8 +124,11 @@ def test_a_search_from_python(config: SearchConfig, tmp_path: Path, executor: Pl
     last = search.run(executor, workers=2, on_progress=progresses.append)
     assert progresses[-1] == last and [generation.filled for generation in last.generations] == [3]
     assert last.best == search.study.best_value == 1.0 and last.seconds_to_go == 0
-    # It is resumed by another program, with more generations; other searches are refused.
+    # Another program's is refused while one runs, and changes nothing. Later it resumes the search, with more generations.
     more = Search.from_file(config.path, tmp_path / "mine")
+    with driver_lock(search.storage, "small", tmp_path / "mine"), pytest.raises(ValueError, match="another program runs"):
+        more.run(executor)
+    assert stored_settings(search.study)["n_generations"] == 1
     assert [generation.filled for generation in more.run(executor).generations] == [3, 3]
     assert len(executor.runs) == 6
     (tmp_path / "other.yml").write_text(config.path.read_text())
@@ -157,6 +169,18 @@ def test_runs_of_a_candidate_differ_in_their_seeds(config: SearchConfig) -> None
         trial = study.ask()
         trial.set_user_attr(SEED_INDEX_KEY, index)
         assert [run.seed for run in make_runs(trial)] == seeds
+
+
+def test_returns_of_a_cross_validation_scale_nothing_else(config: SearchConfig, tmp_path: Path, executor: Planted) -> None:
+    for returns, score in ({"Pendulum-v1": [0, 2]}, 0.5), ({}, 1.0):  # removed, they do not stay with finished runs
+        search = Search.from_file(config.path, tmp_path / "mine", cross_validation={"top": 1, "returns": returns})
+        search.run(executor)
+        assert {trial.value for trial in search.study.trials} == {1.0}
+        list(run_matrix(baselines(search.config, tmp_path / "mine"), executor))
+        assert {found for _, found in stored_baselines(tmp_path / "mine")} == {1.0}
+        matrix = cross_validation.make_matrix(search.config, search.study, tmp_path / "mine")
+        list(run_matrix(matrix, executor))
+        assert set(scores(matrix)["score"]) == {score * 2, score * 3, score * 4}  # of seeds 1, 2, 3
 
 
 SEVERAL = """\
@@ -212,7 +236,7 @@ def test_a_search_on_several_environments_and_of_hyperparameters(tmp_path: Path,
     list(run_matrix(matrix, executor))
     assert stored_baselines(tmp_path / "mine") == [("CURL", 0.75)]
     validation = cross_validation.make_matrix(search.config, search.study, tmp_path / "mine")
-    assert [cell[1:] for cell in validation.runs] == [(task, seed) for seed in (0, 1, 2) for task in tasks]
+    assert [cell[1:] for cell in validation.runs] == [(task, seed) for seed in (1, 2, 3) for task in tasks]
     assert [run.checkpoints[-1] for run in validation.runs.values()] == [400, 200] * 3
 
 

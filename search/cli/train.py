@@ -118,6 +118,8 @@ def video(
     import imageio.v3 as imageio
 
     path, frames = out or (folder if folder.is_dir() else folder.parent) / "video.gif", list[Any]()
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise ValueError(f"--out: {path} must end in .gif or .mp4")
     returns = play(folder, 1, 0, frames)
     # GIF counts in milliseconds, and repeats.
     imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix.lower() == ".gif" else {"fps": FPS}))

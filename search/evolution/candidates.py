@@ -5,12 +5,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from sb3_aarl.search.evolution import mutations, space
 from sb3_aarl.search.evolution.surrogate import TokenModel
 
+from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
 
 # Draws for one slot before a duplicate is accepted: only very small spaces run out of new losses.
@@ -38,7 +39,7 @@ class Settings:
     seed: int | None = None
     screening: int = 1
     n_generations: int | None = None
-    initial: Sequence[AuxLoss] = ()
+    initial: Sequence[Any] = ()
     parent_selection: ParentSelection = "best"
     again: float = 0.0
     climbing: int = 0
@@ -48,8 +49,8 @@ class Settings:
             if isinstance(value, np.generic):  # which no storage takes
                 setattr(self, name, value.item())
         self.operators = None if self.operators is None else tuple(self.operators)
-        losses = self.initial if self.allow_duplicates else {loss.canonical(): loss for loss in self.initial}.values()
-        self.initial = tuple(losses)
+        losses = [catalog.resolve(loss) for loss in self.initial]
+        self.initial = tuple(losses if self.allow_duplicates else {loss.canonical(): loss for loss in losses}.values())
         shares = {name: getattr(self, name) for name in ("random", "replacement", "crossover", "horizon_change")}
         self._check_arguments(shares)
         # Operations of all slots. Random ones come first in later generations: they need no parents.

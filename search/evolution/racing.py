@@ -33,8 +33,7 @@ def standings(scores: np.ndarray, level: float = 0.95) -> Standings:
     if np.isfinite(scores).sum() == 1:  # nothing says how far the true value is
         mean[has_runs], low[has_runs], high[has_runs], p_best[has_runs] = scores[np.isfinite(scores)], -np.inf, np.inf, 1.0
     elif has_runs.any():
-        draws = _draws(scores[has_runs])
-        mean[has_runs] = draws.mean(axis=0)
+        mean[has_runs], draws = _posterior(scores[has_runs])
         low[has_runs], high[has_runs] = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
         p_best[has_runs] = np.bincount(draws.argmax(axis=1), minlength=draws.shape[1]) / len(draws)
     return Standings(mean, low, high, p_best)
@@ -71,10 +70,11 @@ def next_runs(scores: np.ndarray, budget: int, start: int = 2) -> list[tuple[int
     return []
 
 
-def _draws(scores: np.ndarray) -> np.ndarray:
+def _posterior(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Draws of the true values (n_draws, n_losses). They are normal around a common mean, and scores around them. All means,
-    noises (by its logarithm) and deviations of the true values are equally probable before (Gelman, 2006).
+    The means of the true values (n_losses), and draws of them (n_draws, n_losses). They are normal around a common mean, and
+    scores around them. All means, noises (by its logarithm) and deviations of the true values are equally probable before
+    (Gelman, 2006).
     """
     counts = (~np.isnan(scores)).sum(axis=1)
     means = np.nanmean(scores, axis=1)
@@ -87,10 +87,13 @@ def _draws(scores: np.ndarray) -> np.ndarray:
     freedom = max(1, counts.sum() - 2)  # the last prior takes one
     log_p = -0.5 * (np.log(variances).sum(axis=1) + np.log(weights) + freedom * np.log(squares) - np.log(RATIOS))
     p = np.exp(log_p - log_p.max())
+    p /= p.sum()
+    # Not that of the draws: from three scores or less they have none.
+    mean = p @ (centres[:, None] + RATIOS[:, None] / variances * (means - centres[:, None]))
     rng = np.random.default_rng(0)
-    at = rng.choice(len(RATIOS), N_DRAWS, p=p / p.sum())
+    at = rng.choice(len(RATIOS), N_DRAWS, p=p)
     deviation = np.sqrt(squares[at] / rng.chisquare(freedom, N_DRAWS))[:, None]
     centre = centres[at, None] + deviation * rng.standard_normal((N_DRAWS, 1)) / np.sqrt(weights[at, None])
     kept = RATIOS[at, None] / variances[at]
     spread = np.sqrt(kept / counts)
-    return centre + kept * (means - centre) + deviation * spread * rng.standard_normal((N_DRAWS, len(means)))
+    return mean, centre + kept * (means - centre) + deviation * spread * rng.standard_normal((N_DRAWS, len(means)))

@@ -82,7 +82,7 @@ class AuxLossSampler(Settings, BaseSampler):
     :param screening: Offspring that are drawn for each slot, of which the one is kept that the Gaussian process, fitted to the
         generations before, rates highest under one posterior draw; 1 for the paper's evolution
     :param n_generations: Number of generations, for ``free_slots`` and ``stop_when_complete``; None for no end
-    :param initial: Losses for the first slots of the first generation
+    :param initial: Losses for the first slots of the first generation: AuxLoss, names or notations
     :param parent_selection: ``best`` takes the best scores of the last generation, as the paper does; ``posterior`` the losses
         of all generations whose posterior mean, which a Gaussian process of the tokens has of them, is highest
     :param again: Share of the slots of later generations, 0 for the paper's evolution, that train a known loss with another

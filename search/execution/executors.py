@@ -42,7 +42,7 @@ def start_run(folder: str) -> dict[str, Any]:
     if outcome is None:  # it was killed, or told to stop
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
         said = (path / OUTPUT).read_text(encoding="utf-8", errors="replace").strip().rpartition("\n")[2]
-        said = said or "without a message, which a full disk prevents"
+        said = said or "without a message, as when memory or disk are full"
         failure = f"the run's process ended with {how}: {said} (see {path / OUTPUT})" if code else None
         outcome = Outcome(partial_curve(path), failure, retry=bool(code))
     return {"curve": [list(row) for row in outcome.curve], "failure": outcome.failure, "retry": outcome.retry}

@@ -98,8 +98,7 @@ def check_matrix(matrix: Matrix, source: str = "") -> None:
 
 def run_matrix(matrix: Matrix, executor: Executor, workers: int = 1, retries: int = 3) -> Iterator[MatrixProgress]:
     """
-    Train the runs that are not finished, ``workers`` at the same time. Several programs may share a matrix: the lock of each
-    folder decides.
+    Train the runs that are not finished, ``workers`` at the same time.
 
     :raises ValueError: before anything is trained, when a folder has a run with other settings
     """

@@ -106,3 +106,5 @@ def has_driver(storage: BaseStorage, study_name: str, folder: Path) -> bool:
             return False
     except ValueError:
         return True
+    except OSError:
+        return False  # where one can only read

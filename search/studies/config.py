@@ -105,13 +105,13 @@ class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     Cross-validation of the ``top`` candidates of a search (paper, A.4), and of ``top_rated`` others that the surrogate of
     ``screening`` rates highest: a score of one seed is noisy. Without ``environments``, they are the search's. ``checkpoints``
     are the environment steps of the evaluations on each environment, where they differ from the search's. ``returns`` are
-    those that count as 0 and 1 on environments that a search over several does not have. With a ``budget``, candidates race:
-    ``seeds`` are those that each one gets; others follow for those that could still be the best, until the budget is spent,
-    in which a seed on all environments counts as one.
+    those that count as 0 and 1 on its environments, beside those of a search over several. With a ``budget``, candidates
+    race: ``seeds`` are those that each one gets; others follow for those that could still be the best, until the budget is
+    spent, in which a seed on all environments counts as one.
     """
 
     environments: Environments = ()
-    seeds: Seeds = (0, 1, 2)
+    seeds: Seeds = (1, 2, 3)
     top: PositiveInt = 5
     top_rated: NonNegativeInt = 0
     checkpoints: dict[Environment, Checkpoints] = {}
@@ -231,11 +231,10 @@ class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
         task = self.tasks.get(environment)
         return self.checkpoints if task is None or task.checkpoints is None else task.checkpoints
 
-    def returns_on(self, environment: str) -> tuple[float, float] | None:
-        """The returns that count as 0 and 1 on an environment; None where returns count as they are."""
-        if (task := self.tasks.get(environment)) is not None:
-            return task.returns
-        return self.cross_validation.returns.get(environment) if self.cross_validation else None
+    @property
+    def returns(self) -> dict[str, tuple[float, float]]:
+        """The returns that count as 0 and 1 in the search, by environment; without any, returns count as they are."""
+        return {task.environment: task.returns for task in self.environments}
 
     def hyperparameters_for(self, environment: str, baseline: Baseline | None = None) -> dict[str, Any]:
         """The hyper-parameters of a run on an environment, with a baseline's overrides merged over them."""
@@ -293,8 +292,9 @@ def load_config(path: str | Path, **changes: Any) -> SearchConfig:
     for env_id in dict.fromkeys([*config.tasks, *validated]):
         for baseline in (None, *config.baselines):
             config.hyperparameters_for(env_id, baseline)
-        if config.environments and config.returns_on(env_id) is None:
-            raise ConfigError(f"{path}: cross_validation.returns: {env_id} is missing, with the returns that count as 0 and 1")
+    returns = config.returns | (section.returns if section else {})
+    if returns and (missing := ", ".join(env_id for env_id in validated if env_id not in returns)):
+        raise ConfigError(f"{path}: cross_validation.returns: {missing} is missing, with the returns that count as 0 and 1")
     for name, given in (("checkpoints", section.checkpoints), ("returns", section.returns)) if section else ():
         if unused := ", ".join(sorted(given.keys() - set(validated))):
             raise ConfigError(f"{path}: cross_validation.{name}: {unused} is none of its environments")

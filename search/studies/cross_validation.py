@@ -77,7 +77,8 @@ def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselin
         for environment, variant in product(environments, some)
     ]
     by_name = {variant.name: variant for variant in variants}
-    matrix = search_matrix(config, f"{config.name}-cross-validation", folder / "cross-validation", cells, by_name)
+    name, returns = f"{config.name}-cross-validation", config.returns | section.returns
+    matrix = search_matrix(config, name, folder / "cross-validation", cells, by_name, returns)
     # On the search's environments, runs may be longer than those of its candidates.
     checkpoints = {environment: {"checkpoints": steps} for environment, steps in section.checkpoints.items()}
     runs = {cell: run.model_copy(update=checkpoints.get(cell.environment)) for cell, run in matrix.runs.items()}

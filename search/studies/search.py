@@ -20,7 +20,7 @@ from sb3_aarl.search.evolution.space import suggest_aux_loss
 from sb3_aarl.search.execution.driver import Driver, SearchProgress
 from sb3_aarl.search.execution.executors import Executor
 from sb3_aarl.search.execution.matrix import Cell, Matrix, task_name
-from sb3_aarl.search.execution.storage import open_storage
+from sb3_aarl.search.execution.storage import has_driver, open_storage
 from sb3_aarl.search.studies.config import Baseline, SearchConfig, corners, load_config, merge_space
 from sb3_aarl.search.training.folder import FREE, Run, differences
 from sb3_aarl.search.training.setup import check_run
@@ -171,7 +171,8 @@ class Search:
         if SETTINGS_KEY not in study.user_attrs and any(trial.state != TrialState.WAITING for trial in study.trials):
             raise ValueError(f"study {study.study_name!r} is not this search: it has trials of another program. {ADVICE}")
         sampler.progress(study)  # refuses a study with other settings of the sampler
-        study.set_user_attr(SETTINGS_KEY, settings(config))
+        if not has_driver(self.storage, config.name, self.folder):  # which has its own, such as more generations
+            study.set_user_attr(SETTINGS_KEY, settings(config))
         return study
 
     def run(
@@ -186,8 +187,7 @@ class Search:
         :raises RunFailed: after ten candidates that failed one after the other
         """
         runs, retries = runs_of(self.config), self.config.retries
-        returns = {environment: self.config.returns_on(environment) for environment in self.config.tasks}
-        driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, returns)
+        driver = Driver(self.study, self.storage, runs, executor, self.folder, workers, retries, self.config.returns)
         with closing(iter(driver)) as progresses:
             for progress in progresses:
                 on_progress(progress)
@@ -209,19 +209,23 @@ def baselines(config: SearchConfig, folder: Path) -> Matrix:
     """The runs that the candidates are compared with, on the environments and the seeds of the search."""
     variants = {baseline.name: baseline for baseline in config.baselines}
     cells = [Cell(name, environment, seed) for seed, environment, name in product(config.seeds, config.tasks, variants)]
-    return search_matrix(config, f"{config.name}-baselines", folder / "baselines", cells, variants)
+    return search_matrix(config, f"{config.name}-baselines", folder / "baselines", cells, variants, config.returns)
 
 
 def search_matrix(
-    config: SearchConfig, name: str, folder: Path, cells: Sequence[Cell], variants: Mapping[str, Baseline]
+    config: SearchConfig,
+    name: str,
+    folder: Path,
+    cells: Sequence[Cell],
+    variants: Mapping[str, Baseline],
+    returns: Mapping[str, Any],
 ) -> Matrix:
-    """A matrix of runs with the settings of a search."""
+    """A matrix of runs with the settings of a search. ``returns`` are those that count as 0 and 1, by environment."""
     runs, abouts = {}, {}
     for cell in cells:
         variant = variants[cell.variant]
         runs[cell] = make_run(config, cell.environment, variant.aux_loss, cell.seed, variant)
-        if (returns := config.returns_on(cell.environment)) is not None:
-            abouts[cell] = {"returns": returns}
+        abouts[cell] = {"returns": returns.get(cell.environment)}
     return Matrix(name, folder, runs, abouts)
 
 
@@ -241,7 +245,7 @@ def settings(config: SearchConfig) -> dict[str, Any]:
         values["space"] = {name: distribution_to_json(distribution) for name, distribution in config.space.items()}
     if config.environments:
         values["environments"] = {
-            environment: {"returns": config.returns_on(environment), "checkpoints": run.checkpoints, **run.hyperparameters}
+            environment: {"returns": config.returns[environment], "checkpoints": run.checkpoints, **run.hyperparameters}
             for environment, run in runs.items()
         }
     else:

@@ -70,7 +70,7 @@ def check_hyperparameters(values: Mapping[str, Any], env_id: str, source: str) -
 def env_wrappers(value: Any) -> list[tuple[type[gym.Wrapper], dict[str, Any]]]:
     """
     Class and arguments of each wrapper of ``env_wrapper``, the innermost first: a name such as
-    ``gymnasium.wrappers.ClipAction``, a mapping from one name to arguments, or a list of both.
+    ``gymnasium.wrappers.TimeAwareObservation``, a mapping from one name to arguments, or a list of both.
     """
     wrappers = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:

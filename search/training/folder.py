@@ -72,7 +72,7 @@ def prepare_run(folder: Path, run: Run) -> None:
             if key not in free:
                 old, new = ("not set" if value is None else repr(value) for value in (theirs, ours))
                 raise ValueError(
-                    f"{folder} has another run: {key} is {old} there, {new} here. Choose another folder (--folder)"
+                    f"{folder} has another run: {key} is {old} there, {new} here. Choose another --folder, or delete it"
                 )
     replace_text(folder / RUN, json.dumps(values, indent=1) + "\n")
     for name in (STOP, FAILED):
