@@ -38,10 +38,6 @@ COMPILED = ("_act", "_critic_loss", "_aux_loss")
 SelfSACAux = TypeVar("SelfSACAux", bound="SACAux")
 
 
-def _shapes(parameters: Mapping[str, th.Tensor]) -> dict[str, th.Size]:
-    return {name: value.shape for name, value in parameters.items()}
-
-
 def default_learning_starts(total_timesteps: int) -> int:
     """Agent steps with random actions in a run of ``total_timesteps``, unless ``learning_starts`` says how many."""
     return min(5000, total_timesteps // 10)
@@ -210,7 +206,8 @@ class SACAux(SAC):
             self.target_entropy = -share * get_action_dim(self.action_space)
         with warnings.catch_warnings():
             if issubclass(self.replay_buffer_class, WindowReplayBuffer):
-                self._setup_replay_buffer(self.replay_buffer_class)
+                if self.replay_buffer is None:  # load() may be given one, or find it in the file
+                    self._setup_replay_buffer(self.replay_buffer_class)
                 # SB3 expects that no buffer class but its own knows n-step returns.
                 warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
@@ -230,8 +227,6 @@ class SACAux(SAC):
     def _setup_replay_buffer(self, buffer_class: type[WindowReplayBuffer]) -> None:
         if self.env is not None:
             self._frame_stack = detect_frame_stack(self.env)
-        if self.replay_buffer is not None:
-            return  # load() was given one, or found it in the file
         returns = {"n_steps": self.n_steps, "gamma": self.gamma} if self.n_steps > 1 else {}
         kwargs = {"frame_stack": self._frame_stack, **returns, **(self.replay_buffer_kwargs or {})}
         space, actions, n_envs = self.observation_space, self.action_space, self.n_envs
@@ -250,8 +245,6 @@ class SACAux(SAC):
         for name in ("tau", "gamma"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
-        if self.policy_kwargs.get("n_critics", 2) < 1:
-            raise ValueError(f"policy_kwargs: n_critics must be at least 1, not {self.policy_kwargs['n_critics']}")
         if self.precision not in ("fp32", "bf16"):
             raise ValueError(f"precision must be fp32 or bf16, not {self.precision!r}")
         fixed = np.flatnonzero(self.action_space.low == self.action_space.high)  # type: ignore[attr-defined]
@@ -457,27 +450,26 @@ class SACAux(SAC):
     @contextmanager
     def _logged(self) -> Iterator[Callable[[str, th.Tensor], None]]:
         """Yields ``log(name, value)``; then logs the means over gradient steps, and stops a run that has diverged."""
-        names: list[tuple[str, int]] = []
-        tensors: list[th.Tensor] = []
+        logged: list[tuple[str, int, th.Tensor]] = []
 
         def log(name: str, value: th.Tensor) -> None:
-            names.append((name, self._n_updates))
-            tensors.append(value.detach().reshape(()))
+            logged.append((name, self._n_updates, value.detach().reshape(())))
 
         try:
             yield log
         finally:  # the first loss that is not finite says more than an error that comes of it
             losses: dict[str, dict[int, float]] = defaultdict(dict)
-            for (name, step), value in zip(names, th.stack(tensors).tolist() if tensors else [], strict=True):
+            values = th.stack([tensor for *_, tensor in logged]).tolist() if logged else []
+            for (name, step, _), value in zip(logged, values, strict=True):
                 if not math.isfinite(value):
                     raise NonFiniteError(f"{name} is {value} at {self._describe(step)}")
                 losses[name][step] = value
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/aux_skipped", self._n_aux_skipped)
         self.logger.record("train/reward_scale", self._reward_scale)
-        for name, values in losses.items():
+        for name, by_step in losses.items():
             if name != "largest_reward":
-                self.logger.record(f"train/{name}", sum(values.values()) / len(values))
+                self.logger.record(f"train/{name}", sum(by_step.values()) / len(by_step))
         if losses:
             self._q_value_check(losses, self.gamma, get_action_dim(self.action_space), self._describe)
 
@@ -582,7 +574,8 @@ class SACAux(SAC):
         if not isinstance(given, dict):
             given = load_from_zip_file(given, device=device, load_data=False)[1]
         own, auxiliary = self.get_parameters(), {"aux_head", "aux_optimizer"}
-        if _shapes(own.get("aux_head", {})) != _shapes(given.get("aux_head", {})):
+        shapes = [{name: value.shape for name, value in some.get("aux_head", {}).items()} for some in (own, given)]
+        if shapes[0] != shapes[1]:
             logger.warning("no parameters of this model's aux_loss (%s) are given: its own stay as they are", self.aux_loss)
             given = {name: value for name, value in given.items() if name not in auxiliary}
             given |= {name: own[name] for name in auxiliary & own.keys()}
