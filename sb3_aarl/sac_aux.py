@@ -245,6 +245,8 @@ class SACAux(SAC):
         for name in ("tau", "gamma"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
+        if self.policy_kwargs.get("n_critics", 2) < 1:
+            raise ValueError(f"policy_kwargs: n_critics must be at least 1, not {self.policy_kwargs['n_critics']}")
         if self.precision not in ("fp32", "bf16"):
             raise ValueError(f"precision must be fp32 or bf16, not {self.precision!r}")
         fixed = np.flatnonzero(self.action_space.low == self.action_space.high)  # type: ignore[attr-defined]
@@ -366,7 +368,7 @@ class SACAux(SAC):
                     self._update_target()
                 # Running statistics of the encoder are copied, see SB3's issue 996.
                 polyak_update(self.critic.running_statistics, self.critic_target.running_statistics, 1.0)
-        self.policy.set_training_mode(False)  # whoever reads Q values between steps changes no running statistics
+        self.policy.set_training_mode(False)  # reading Q values between steps changes no running statistics
 
     def _act(self, observations: PyTorchObs | Trunk) -> tuple[th.Tensor, th.Tensor]:
         """Actions of the actor and their log probabilities, (batch, action_dim) and (batch, 1)."""

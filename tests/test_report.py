@@ -147,6 +147,7 @@ def test_what_the_report_says(study, page):
     assert f"Best so far: {best[0].value:.2f}" in text and "Baselines: SAC & co 150.00" in text
     assert table_after(page, "Settings") == [[name, str(value)] for name, value in study.user_attrs["settings"].items()]
     assert f"trained on {EVIL} and evaluated at 2,000, 40,000 environment steps with 3 episodes." in text
+    assert "mean of 2 runs" in text
     assert dict(table_after(page, "What wrote this report")).keys() >= {"commit", "cpu", "versions"}
     versions = Counter(trial.user_attrs["versions"] for trial in study.trials if "versions" in trial.user_attrs)
     assert dict(table_after(page, "Versions of packages, by trials")) == {name: str(n) for name, n in versions.items()}

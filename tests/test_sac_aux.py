@@ -812,6 +812,7 @@ def test_augmentation_is_saved(argument: dict[str, Any], tmp_path: pathlib.Path)
         ("state", {"policy_delay": 0}, r"policy_delay must be at least 1, not 0"),
         ("state", {"n_steps": 0}, r"n_steps must be at least 1, not 0"),
         ("state", {"gamma": 5}, r"gamma must be between 0 and 1, not 5"),
+        ("state", {"policy_kwargs": {"n_critics": 0}}, r"policy_kwargs: n_critics must be at least 1, not 0"),
         ("state", {"aux_kwargs": {"tau": 2}}, r"aux_kwargs: tau must be between 0 and 1, not 2"),
         ("state", {"aux_kwargs": {"predictor_width": 0}}, r"aux_kwargs: predictor_width must be at least 1, not 0"),
         ("state", {"aux_kwargs": {"tua": 0.1}}, r"aux_kwargs: an unexpected .*'tua'"),
