@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 from concurrent.futures import Future
 from pathlib import Path
@@ -159,6 +160,8 @@ def test_a_run_that_is_there_twice_is_refused(folder: Path) -> None:
     assert len(curves) == 8 and set(curves["env"]) == {ENV} and set(curves["environment_steps"]) == {200, 400}
     path = cell_folder(Path("out"), Cell("mine", ENV, 1))
     assert ".." not in cell_folder(Path("out"), Cell("..", ENV, 1)).parts
+    shutil.copytree("out", "out/another")  # another benchmark, in a folder below
+    assert len(read_abouts(Path("out"))) == 4
     about = read_about(path)
     write_about(path, {**about, "seed": 0})
     with pytest.raises(ValueError, match=f"have the same run: mine on {ENV}, seed 0"):

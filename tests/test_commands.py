@@ -184,7 +184,8 @@ def test_status_of_a_search_and_its_baselines(folder: Path, executor: Planted) -
     assert shown == run("status", "runs/small")
     assert "generation 1: 3/3 done, 0 running, 0 failed" in shown and "finished" in shown
     write_search(folder, BASELINES + "overrides: {gamma: 0.5}\n")
-    assert "it was started with gamma=None, not 0.5" in run("baselines", "small.yml", code=2)
+    for storage in ((), ("--storage", "sqlite:///runs/small/study.db", "--folder", "another")):
+        assert "it was started with gamma=None, not 0.5" in run("baselines", "small.yml", *storage, code=2)
     write_search(folder, BASELINES)
     run("baselines", "small.yml")
     assert re.search(r"SAC +│ +1 │ +1 │ +0 │", run("status", "small.yml"))

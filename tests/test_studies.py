@@ -21,7 +21,7 @@ from sb3_aarl.search.execution.matrix import Cell, run_matrix, scores
 from sb3_aarl.search.execution.storage import driver_lock
 from sb3_aarl.search.results.report import stored_baselines
 from sb3_aarl.search.studies import cross_validation
-from sb3_aarl.search.studies.config import SearchConfig, load_config
+from sb3_aarl.search.studies.config import SearchConfig, load_config, merge_space
 from sb3_aarl.search.studies.search import (
     SETTINGS_KEY,
     Search,
@@ -193,6 +193,7 @@ environments:
 space:
   batch_size: [8, 16]
   learning_rate: {type: float, low: 1e-4, high: 1e-2, log: true}
+  policy_kwargs.net_arch: [[8], [8, 8]]
 baselines:
 - {name: CURL, aux_loss: curl}
 cross_validation: {top: 1}
@@ -210,6 +211,8 @@ def test_a_search_on_several_environments_and_of_hyperparameters(tmp_path: Path,
         for run, gamma in zip(runs, (None, 0.9), strict=True):
             assert run.hyperparameters.get("gamma") == gamma
             assert all(run.hyperparameters[name] == trial.params[name] for name in ("batch_size", "learning_rate"))
+            assert run.hyperparameters["policy_kwargs"]["net_arch"] in ([8], [8, 8])
+        assert {*trial.distributions.values()}  # Optuna's plots and dashboard hash them
         # The AULC is 1 on both: a half, and 1.
         assert trial.user_attrs["scores"] == dict(zip(tasks, (0.5, 1.0), strict=True)) and trial.value == 0.75
     assert {trial.params["batch_size"] for trial in search.study.trials} <= {8, 16}
@@ -217,8 +220,10 @@ def test_a_search_on_several_environments_and_of_hyperparameters(tmp_path: Path,
     matrix = cross_validation.make_matrix(search.config, search.study, tmp_path)
     best = search.study.best_trial
     values = cross_validation.searched_values(search.config, search.study)[loss_of(best).canonical()]
-    assert values == {name: best.params[name] for name in ("batch_size", "learning_rate")}
-    assert len(matrix.runs) == 6 and all(run.hyperparameters.items() >= values.items() for run in matrix.runs.values())
+    assert values == {name: best.params[name] for name in search.config.space}
+    assert len(matrix.runs) == 6
+    for run in matrix.runs.values():
+        assert merge_space(run.hyperparameters, values) == run.hyperparameters
 
     for changes, message in (
         ({"overrides": {"gamma": 0.8}}, "environments.Pendulum-v1.gamma=None, not 0.8"),

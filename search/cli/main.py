@@ -3,7 +3,6 @@
 import logging
 import signal
 import sys
-import warnings
 from importlib import metadata
 from typing import Annotated, Any
 
@@ -20,8 +19,6 @@ class Program(TyperGroup):
     """Ends with one line and a code: 2 for input that cannot be used, 1 for runs that failed, 130 for an interruption."""
 
     def invoke(self, ctx: Any) -> Any:
-        # Lists, such as those of net_arch in `space`, are stored as well as numbers.
-        warnings.filterwarnings("ignore", message="Choices for a categorical distribution")
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:

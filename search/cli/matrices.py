@@ -82,6 +82,7 @@ def exit_if_failed(matrix: "Matrix") -> None:
 @app.command(rich_help_panel="A search")
 def baselines(
     config: SearchFile,
+    storage: Storage = None,
     workers: Workers = None,
     threads: Threads = None,
     folder: Folder = None,
@@ -94,15 +95,17 @@ def baselines(
     """Train the baselines of a search, which its candidates are compared with."""
     execution = options.Execution(executor, ray_address, slurm, cpus_per_run, gpus_per_run)
 
-    from sb3_aarl.search.execution.storage import STUDY_FILE, load_study, open_storage
+    from optuna import get_all_study_names
+    from sb3_aarl.search.execution.storage import STUDY_FILE, load_study
     from sb3_aarl.search.studies import search
 
-    searched = search.Search.from_file(config, folder, threads=threads)
+    searched = search.Search.from_file(config, folder, storage, threads=threads)
     settings = searched.config
     if not settings.baselines:
         raise ValueError(f"{config} names no baselines")
-    if (searched.folder / STUDY_FILE).exists():
-        search.check_study(load_study(open_storage(searched.folder), settings.name), settings, free=("threads",))
+    is_begun = settings.name in get_all_study_names(searched.storage) if storage else (searched.folder / STUDY_FILE).exists()
+    if is_begun:
+        search.check_study(load_study(searched.storage, settings.name), settings, free=("threads",))
     matrix = search.baselines(settings, searched.folder)
     train_matrix(matrix, execution, workers, settings.retries, config)
     compare(matrix, "Baselines, AULC")

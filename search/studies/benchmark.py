@@ -149,9 +149,13 @@ def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     """
     abouts: dict[Path, dict[str, Any]] = {}
     folders: dict[Cell, Path] = {}
-    file = folder / VARIANTS
-    parts = (RUNS, *validated(Experiment, read_yaml(file), str(file)).runs) if file.exists() else ("",)
-    for path in sorted(found.parent for part in parts for found in (folder / part).rglob(ABOUT)):
+    file, runs, found = folder / VARIANTS, folder, list[Path]()
+    if file.exists():
+        runs = folder / RUNS
+        found += (
+            path for part in validated(Experiment, read_yaml(file), str(file)).runs for path in (folder / part).rglob(ABOUT)
+        )
+    for path in sorted(path.parent for path in (*found, *runs.glob(f"*/*/*/{ABOUT}"))):
         about = {"sessions": [], **read_about(path)}
         if "checkpoints" not in about:  # of another matrix
             continue

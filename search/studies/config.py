@@ -1,5 +1,6 @@
 """Configuration of a search: one YAML file, checked before anything runs."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import fields
 from itertools import product
@@ -73,7 +74,8 @@ def _distribution(value: Any) -> BaseDistribution:
     kinds = {"int": IntDistribution, "float": FloatDistribution}
     try:
         if isinstance(value, list):
-            return CategoricalDistribution(value)
+            # Lists and mappings as text: Optuna's plots and dashboard want choices that can be hashed.
+            return CategoricalDistribution([json.dumps(item) if isinstance(item, list | dict) else item for item in value])
         return kinds[value["type"]](**{name: item for name, item in value.items() if name != "type"})
     except (KeyError, TypeError):
         wanted = "a list of choices, or {type: int or float, low: .., high: ..}, with log: true or step: .. if wanted"
@@ -315,6 +317,8 @@ def merge_space(hyperparameters: Mapping[str, Any], values: Mapping[str, Any]) -
     """Hyper-parameters with the values of a search's ``space`` merged over them, by names with dots."""
     merged = dict(hyperparameters)
     for name, value in values.items():
+        if isinstance(value, str) and value.startswith(("[", "{")):
+            value = json.loads(value)
         for part in reversed(name.split(".")):
             value = {part: value}
         merged = training.merge(merged, value)

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 SETTINGS_KEY = "settings"  # user attribute of a study
 # Settings of a search that may differ when it is resumed; those of its runs are in FREE.
-FREE_OF_SEARCH = ("n_generations", "pruner")
+FREE_OF_SEARCH = ("imports", "n_generations", "pruner")
 # Of the repetitions of a loss: far from those of a cross-validation.
 SEEDS_APART = 1000
 ADVICE = "Another search needs a file of another name, another folder or another storage"

@@ -64,7 +64,7 @@ def prepare_run(folder: Path, run: Run) -> None:
     values = run.model_dump(mode="json")
     if (folder / RUN).exists():
         stored = read_run(folder).model_dump(mode="json")
-        free = [f"hyperparameters.{name}" for name in FREE]
+        free = ["imports", *(f"hyperparameters.{name}" for name in FREE)]
         is_longer = values["checkpoints"][: len(stored["checkpoints"])] == stored["checkpoints"]
         if is_longer and '"lin_' not in json.dumps(stored["hyperparameters"]) and not is_finished(folder):
             free.append("checkpoints")

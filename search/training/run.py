@@ -123,7 +123,7 @@ def main() -> None:
         parser.error(f"{arguments.folder / RUN} does not exist")
     if arguments.end_with_stdin:
         threading.Thread(target=_end_with_stdin, daemon=True).start()
-    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)
     try:
         train(arguments.folder)
     except Timeout as error:  # the process that trains it writes the outcome
