@@ -60,7 +60,8 @@ class LearningCurveCallback(BaseCallback):
     :param on_evaluation: Called after each evaluation; training stops if it returns False
     :param curve: Evaluations before this run was resumed
     :param verbose: 1 prints each evaluation
-    :raises ValueError: when the checkpoints are not ascending, or lie between two agent steps, or a VecEnv is too large
+    :raises ValueError: when the checkpoints are not ascending, lie between two agent steps or before those of a model that
+        goes on, or a VecEnv is too large
     """
 
     def __init__(
@@ -96,8 +97,14 @@ class LearningCurveCallback(BaseCallback):
         self.path = None if path is None else Path(path)
         self.on_evaluation = on_evaluation
         self.curve = list(curve)
+        self._started = 0.0
 
     def _on_training_start(self) -> None:
+        environment_steps = self.num_timesteps * self.action_repeat
+        if self._started and not environment_steps:
+            self.curve = []  # that was another run's
+        if not self.curve and self.checkpoints[0] < environment_steps:
+            raise ValueError(f"checkpoint {self.checkpoints[0]} is over: the model has {environment_steps} environment steps")
         self._seconds_before = self.curve[-1].seconds if self.curve else 0.0
         self._started = time.monotonic()
 

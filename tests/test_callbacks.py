@@ -91,6 +91,16 @@ def test_seconds_continue_with_training(monkeypatch: pytest.MonkeyPatch) -> None
     assert [point.seconds for point in callback.curve] == [10.0, 20.0]
 
 
+def test_another_run_is_evaluated_anew_and_no_checkpoint_that_is_over() -> None:
+    model, callback = make_model(Walk()), LearningCurveCallback(Walk(), [10, 20], 1)
+    first = list(model.learn(20, callback) and callback.curve)
+    model.learn(20, callback)
+    assert [point.environment_steps for point in callback.curve] == [10, 20] and callback.curve != first
+    late = LearningCurveCallback(Walk(), [10, 30], 1)
+    with pytest.raises(ValueError, match="checkpoint 10 is over: the model has 20 environment steps"):
+        model.learn(10, late, reset_num_timesteps=False)
+
+
 def play(model: SACAux, env: gym.Env, seed: int) -> tuple[float, int]:
     """Return and length of the deterministic episode with a seed."""
     observation, _ = env.reset(seed=seed)
