@@ -149,13 +149,11 @@ def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     """
     abouts: dict[Path, dict[str, Any]] = {}
     folders: dict[Cell, Path] = {}
-    file, runs, found = folder / VARIANTS, folder, list[Path]()
-    if file.exists():
-        runs = folder / RUNS
-        found += (
-            path for part in validated(Experiment, read_yaml(file), str(file)).runs for path in (folder / part).rglob(ABOUT)
-        )
-    for path in sorted(path.parent for path in (*found, *runs.glob(f"*/*/*/{ABOUT}"))):
+    file, runs = folder / VARIANTS, folder / RUNS
+    found = [*(runs if runs.exists() else folder).glob(f"*/*/*/{ABOUT}")]
+    for other in validated(Experiment, read_yaml(file), str(file)).runs if file.exists() else ():
+        found += (folder / other).rglob(ABOUT)
+    for path in sorted(path.parent for path in found):
         about = {"sessions": [], **read_about(path)}
         if "checkpoints" not in about:  # of another matrix
             continue
