@@ -43,7 +43,7 @@ def open_storage(folder: Path | None, url: str | None = None, create: bool = Tru
     return RDBStorage(url, engine_kwargs=engine)
 
 
-def load_study(storage: RDBStorage, name: str | None = None) -> optuna.Study:
+def load_study(storage: BaseStorage, name: str | None = None) -> optuna.Study:
     """Load a study of one objective by its name, or the only one; a ValueError names those that are there."""
     names = optuna.get_all_study_names(storage)
     if name is None and len(names) == 1:

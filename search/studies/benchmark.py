@@ -151,8 +151,8 @@ def read_abouts(folder: Path) -> dict[Path, dict[str, Any]]:
     folders: dict[Cell, Path] = {}
     file, runs = folder / VARIANTS, folder / RUNS
     found = [*(runs if runs.exists() else folder).glob(f"*/*/*/{ABOUT}")]
-    for other in validated(Experiment, read_yaml(file), str(file)).runs if file.exists() else ():
-        found += (folder / other).rglob(ABOUT)
+    for part in validated(Experiment, read_yaml(file), str(file)).runs if file.exists() else ():
+        found += (folder / part).rglob(ABOUT)
     for path in sorted(path.parent for path in found):
         about = {"sessions": [], **read_about(path)}
         if "checkpoints" not in about:  # of another matrix

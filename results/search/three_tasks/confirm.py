@@ -8,6 +8,7 @@ runs are exchanged within each task, and the difference that a test at 0.05 woul
 
 import sys
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 from scipy.stats import norm
@@ -34,7 +35,7 @@ def shares(folder: Path) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for path in sorted(folder.glob("*/seed-*/curve.csv")):
         task = path.parent.parent.name
-        found.setdefault(task, []).append(np.mean([point.mean for point in read_curve(path)]) / REFERENCE[task])
+        found.setdefault(task, []).append(fmean(point.mean for point in read_curve(path)) / REFERENCE[task])
     return found
 
 
