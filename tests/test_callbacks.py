@@ -93,7 +93,8 @@ def test_seconds_continue_with_training(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_another_run_is_evaluated_anew_and_no_checkpoint_that_is_over() -> None:
     model, callback = make_model(Walk()), LearningCurveCallback(Walk(), [10, 20], 1)
-    first = list(model.learn(20, callback) and callback.curve)
+    model.learn(20, callback)
+    first = callback.curve
     model.learn(20, callback)
     assert [point.environment_steps for point in callback.curve] == [10, 20] and callback.curve != first
     late = LearningCurveCallback(Walk(), [10, 30], 1)

@@ -119,6 +119,7 @@ def test_a_folder_of_another_run_is_refused(changes: dict[str, Any], key: str, t
     with pytest.raises(ValueError, match=f"{tmp_path}/run has another run: {key}"):
         prepare_run(tmp_path / "run", make_run(**changes))
     assert (tmp_path / "run" / "run.json").read_bytes() == before
+    prepare_run(tmp_path / "run", make_run(imports=("json",)))
     falling = DENSE | {"learning_rate": "lin_1e-3"}  # of a longer run it is another schedule
     prepare_run(tmp_path / "falling", make_run(hyperparameters=falling))
     with pytest.raises(ValueError, match="checkpoints is"):
@@ -285,10 +286,12 @@ def test_a_full_disk_is_the_reason_of_a_failure(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.slow
 def test_an_environment_that_ends_its_process_leaves_no_outcome(tmp_path: Path) -> None:
     """And the modules that register environments are found in the working directory."""
-    (tmp_path / "exits.py").write_text(EXITS)
+    log = "import logging; logging.info('of another library')"
+    (tmp_path / "exits.py").write_text(EXITS.replace("os._exit(3)", f"{log}; os._exit(3)"))
     prepare_run(tmp_path / "run", make_run(environment="Exits-v0", imports=("exits",), checkpoints=(10, 30)))
     program = [sys.executable, "-m", "sb3_aarl.search.training.run", str(tmp_path / "run")]
-    assert subprocess.run(program, cwd=tmp_path, capture_output=True).returncode == 3
+    ended = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode == 3 and "of another library" not in ended.stderr  # its last line is the reason of a failure
     assert read_outcome(tmp_path / "run") is None
 
 

@@ -67,7 +67,7 @@ def test_a_search_is_opened_again(config: SearchConfig, tmp_path: Path) -> None:
     storage = InMemoryStorage()
     study = Search(config, storage=storage).study
     study.enqueue_trial(loss_to_params(LOSSES[0]))
-    more = {"generations": 9, "retries": 1, "overrides": {"device": "cpu"}, "pruner": "median"}
+    more = {"generations": 9, "retries": 1, "overrides": {"device": "cpu"}, "pruner": "median", "imports": ["json"]}
     again = Search(load_config(config.path, **more), storage=storage).study
     assert again.study_name == "small" and len(again.trials) == 1
     assert study.direction == optuna.study.StudyDirection.MAXIMIZE and isinstance(study.sampler, AuxLossSampler)

@@ -103,8 +103,8 @@ def baselines(
     settings = searched.config
     if not settings.baselines:
         raise ValueError(f"{config} names no baselines")
-    is_begun = settings.name in get_all_study_names(searched.storage) if storage else (searched.folder / STUDY_FILE).exists()
-    if is_begun:
+    is_started = settings.name in get_all_study_names(searched.storage) if storage else (searched.folder / STUDY_FILE).exists()
+    if is_started:
         search.check_study(load_study(searched.storage, settings.name), settings, free=("threads",))
     matrix = search.baselines(settings, searched.folder)
     train_matrix(matrix, execution, workers, settings.retries, config)
