@@ -6,6 +6,7 @@ Train an algorithm of sb3-contrib as `aarl benchmark` trains SACAux; the same co
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import torch as th
 from sb3_aarl.search.training.provenance import add_session, read_about, write_about
@@ -16,9 +17,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, read_curve
 
 # RL-Zoo's for MuJoCo's tasks, but CrossQ has sb3-contrib's default width: 1024 instead of 2048, a third of the time.
-SETTINGS = {"tqc": {"learning_starts": 10_000}, "crossq": {"learning_starts": 5_000}}
+SETTINGS: dict[str, dict[str, Any]] = {"tqc": {"learning_starts": 10_000}, "crossq": {"learning_starts": 5_000}}
 HOPPER = {"tqc": {"top_quantiles_to_drop_per_net": 5}}
-ALGORITHMS = {"tqc": TQC, "crossq": CrossQ}
+ALGORITHMS: dict[str, type[TQC] | type[CrossQ]] = {"tqc": TQC, "crossq": CrossQ}
 FOLDER = Path(__file__).resolve().parent / "runs"
 
 
