@@ -191,6 +191,17 @@ def test_status_of_a_search_and_its_baselines(folder: Path, executor: Planted) -
     assert re.search(r"SAC +│ +1 │ +1 │ +0 │", run("status", "small.yml"))
 
 
+def test_a_search_refuses_baselines_of_other_settings(folder: Path, executor: Planted) -> None:
+    write_search(folder, BASELINES)
+    executor.scores = {None: 3.0}
+    run("baselines", "small.yml")
+    write_search(folder, BASELINES + "overrides: {gamma: 0.5}\n")
+    assert "has another run: hyperparameters.gamma is not set there, 0.5 here" in run("search", "small.yml", code=2)
+    assert "has another run" not in run("search", "small.yml", "--folder", "another")
+    write_search(folder, BASELINES)
+    assert "Best" in run("search", "small.yml")
+
+
 @pytest.mark.parametrize("sampler", [AuxLossSampler(seed=0, population_size=2, n_random=2, n_prior=0), RandomSampler(seed=0)])
 def test_status_of_a_study_made_in_python(sampler: BaseSampler) -> None:
     def objective(trial: optuna.Trial) -> float:
@@ -202,7 +213,8 @@ def test_status_of_a_study_made_in_python(sampler: BaseSampler) -> None:
     study = optuna.create_study(
         storage=open_storage(Path("runs/own")), sampler=sampler, direction="maximize", study_name="own"
     )
-    assert "None" not in run("status", "own")
+    assert "None" not in (shown := run("status", "own")) and "No driver" not in shown
+    study.set_user_attr("settings", {"rate": 0.1})  # of one's own
     study.optimize(objective, 40, catch=ValueError, callbacks=[lambda study, trial: trial.value is None or study.stop()])
     shown = run("status", "own")
     progress = re.search(r"generation 1: (\d+)/\d+ done, 0 running, (\d+) failed", shown)

@@ -201,6 +201,20 @@ def test_equal_scores_go_by_slot_and_pruned_or_infinite_ones_come_last() -> None
     assert parents(0.75) == {1, 5, 6, 0, 4, 2}
 
 
+def test_after_a_generation_without_scores_the_parents_are_those_of_before() -> None:
+    study = make_study(n_generations=3)
+    while not sampler_of(study).is_complete(study):
+        trial = study.ask()
+        loss = suggest_aux_loss(trial, 2)
+        is_pruned = trial.user_attrs["generation"] == 2
+        study.tell(trial, None if is_pruned else score(loss), TrialState.PRUNED if is_pruned else None)
+    parents = [
+        {number for trial in study.trials if trial.user_attrs["generation"] == i for number in trial.user_attrs["parents"]}
+        for i in (2, 3)
+    ]
+    assert parents[0] >= parents[1] != set()
+
+
 def test_initial_losses_are_the_first_slots() -> None:
     losses = [WANTED, AuxLoss.parse("{s_t} -> {r_t}"), AuxLoss.parse("{s_t+1} -> {r_t+1}")]  # the last is the second again
     study = make_study(initial=losses, n_random=2, n_prior=1)

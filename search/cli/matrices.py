@@ -35,10 +35,11 @@ def train_matrix(
     check_matrix(matrix, str(config))
     at_once = execution.at_once(workers, len(matrix.runs))
     with execution.start(at_once, matrix.folder) as executor, live() as show:
-        for part in [matrix] if parts is None else parts:
+        for number, part in enumerate([matrix] if parts is None else parts, 1):
+            name = matrix.name if len(part.runs) == len(matrix.runs) else f"{matrix.name}, round {number}"
             for progress in run_matrix(part, executor, at_once, retries):
                 counts = f"{progress.finished}/{progress.total} runs, {progress.failed} failed"
-                show(f"{matrix.name}: {counts}, {time_to_go(progress.seconds_to_go)}", counts)
+                show(f"{name}: {counts}, {time_to_go(progress.seconds_to_go)}", counts)
 
 
 def unfinished(matrix: "Matrix") -> "dict[str, list[Run]]":

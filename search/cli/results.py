@@ -32,6 +32,7 @@ def status(
     """Show how far a search, with its baselines and cross-validation, or a benchmark is."""
     from sb3_aarl.search.cli.search import progress_line
     from sb3_aarl.search.execution.storage import STUDY_FILE, open_storage
+    from sb3_aarl.search.studies.search import SETTINGS_KEY
     from sb3_aarl.search.studies.status import PARTS, matrix_status, search_status
 
     path = search_folder(search)
@@ -40,7 +41,11 @@ def status(
         study, path = open_study(path, storage)
         progress, runs = search_status(study, open_storage(path, storage, create=False), path)
         is_over = all(row.filled == row.slots for row in progress.generations)
-        hint = "" if runs or is_over else "\nNo driver runs here: the same aarl search resumes it."
+        hint = (
+            ""
+            if runs or is_over or SETTINGS_KEY not in study.user_attrs
+            else "\nNo driver runs here: the same aarl search resumes it."
+        )
         loss = "" if progress.best_loss is None else f", {progress.best_loss}"
         say(f"Search {path}\n{progress_line(progress).replace('; ', chr(10))}{loss}{hint}")
         found = True

@@ -165,7 +165,7 @@ class Candidates:
             ratings = list(self.model.posterior([result.loss for result in of_whom])[0])
         n_parents = max(1, round(settings.parents * len(results)))
         order = sorted(range(len(of_whom)), key=lambda index: -ratings[index])
-        self.parents = [of_whom[index] for index in order[:n_parents]] or list(results)
+        self.parents = [of_whom[index] for index in order[:n_parents]] or self.parents or list(results)
         self.generation += 1
         self.to_plan.extend(self._round())
 

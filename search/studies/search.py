@@ -19,10 +19,10 @@ from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import suggest_aux_loss
 from sb3_aarl.search.execution.driver import Driver, SearchProgress
 from sb3_aarl.search.execution.executors import Executor
-from sb3_aarl.search.execution.matrix import Cell, Matrix, task_name
+from sb3_aarl.search.execution.matrix import Cell, Matrix, cell_folder, task_name
 from sb3_aarl.search.execution.storage import has_driver, open_storage
 from sb3_aarl.search.studies.config import Baseline, SearchConfig, corners, load_config, merge_space
-from sb3_aarl.search.training.folder import FREE, Run, differences
+from sb3_aarl.search.training.folder import FREE, Run, differences, prepare_run
 from sb3_aarl.search.training.setup import check_run
 
 from sb3_aarl import catalog
@@ -171,6 +171,11 @@ class Search:
         if SETTINGS_KEY not in study.user_attrs and any(trial.state != TrialState.WAITING for trial in study.trials):
             raise ValueError(f"study {study.study_name!r} is not this search: it has trials of another program. {ADVICE}")
         sampler.progress(study)  # refuses a study with other settings of the sampler
+        if SETTINGS_KEY not in study.user_attrs:
+            matrix = baselines(config, self.folder)
+            for cell, run in matrix.runs.items():
+                if (path := cell_folder(matrix.folder, cell)).exists():
+                    prepare_run(path, run)  # refuses that of other settings, with which nothing could be compared
         if not has_driver(self.storage, config.name, self.folder):  # which has its own, such as more generations
             study.set_user_attr(SETTINGS_KEY, settings(config))
         return study

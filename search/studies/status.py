@@ -11,9 +11,8 @@ from optuna.trial import TrialState
 from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
 from sb3_aarl.search.execution import driver
 from sb3_aarl.search.execution.storage import has_driver
-from sb3_aarl.search.studies.search import stored_settings
-from sb3_aarl.search.training.folder import RUN, read_outcome
-from sb3_aarl.search.training.provenance import read_about
+from sb3_aarl.search.training.folder import read_outcome
+from sb3_aarl.search.training.provenance import ABOUT, read_about
 
 from sb3_aarl.aux_loss import AuxLoss
 
@@ -26,7 +25,7 @@ def search_status(study: optuna.Study, storage: BaseStorage, folder: Path) -> tu
     The progress of a search, and whether its driver runs. All trials of a study without an ``AuxLossSampler`` count as one
     generation.
     """
-    if settings := stored_settings(study):
+    if settings := AuxLossSampler.stored_settings(study):
         settings["initial"] = [AuxLoss.parse(loss) for loss in settings["initial"]]
         arguments = {name: settings[name] for name in inspect.signature(AuxLossSampler).parameters if name in settings}
         generations = AuxLossSampler(**arguments).progress(study)
@@ -40,7 +39,7 @@ def search_status(study: optuna.Study, storage: BaseStorage, folder: Path) -> tu
 
 def matrix_status(folder: Path) -> pd.DataFrame:
     """How many runs of each variant of a matrix there are, are done, and failed."""
-    outcomes = {file.parent: read_outcome(file.parent) for file in sorted(folder.glob(f"*/*/*/{RUN}"))}
+    outcomes = {file.parent: read_outcome(file.parent) for file in sorted(folder.glob(f"*/*/*/{ABOUT}"))}
     rows = [
         (read_about(path)["variant"], 1, bool(outcome and outcome.failure is None), bool(outcome and outcome.failure))
         for path, outcome in outcomes.items()

@@ -23,5 +23,5 @@ def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path
     if name not in by_name:
         nearest = difflib.get_close_matches(name, by_name, n=1)
         hint = f", nearest: {nearest[0]}" if nearest else f": {', '.join(whole)}"
-        raise ValueError(f"{path} is no file, nor the name of a shipped one{hint}")
+        raise ValueError(f"{folder / path} is no file, nor the name of a shipped one{hint}")
     return by_name[name]
