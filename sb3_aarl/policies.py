@@ -376,6 +376,9 @@ class SACAuxPolicy(SACPolicy):
         }
 
 
+MlpPolicy = SACAuxPolicy
+
+
 class CnnPolicy(SACAuxPolicy):
     """SACAuxPolicy with CURL's pixel encoder by default. Parameters as there."""
 

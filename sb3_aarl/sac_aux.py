@@ -61,7 +61,7 @@ class SACAux(SAC):
         two have their own
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts; None (default, until ``learn``) for 5,000,
-        or a tenth of each ``learn`` if that is less. A model that goes on without its replay buffer begins with as many
+        or a tenth of ``learn`` if that is less; none where it goes on, but without its replay buffer as many
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 1 copies them at each update (no targets, as in CrossQ); 0 freezes
         the target critic's weights
@@ -223,6 +223,7 @@ class SACAux(SAC):
             logger.warning("precision='bf16': this %s has no instructions for it, training in fp32", self.device.type.upper())
         if self.compile:
             self._compile_losses()
+        self.policy.set_training_mode(False)  # reading Q values before learn() changes no running statistics
 
     def _setup_replay_buffer(self, buffer_class: type[WindowReplayBuffer]) -> None:
         if self.env is not None:
@@ -508,12 +509,14 @@ class SACAux(SAC):
         if not reset_num_timesteps and self._stored_timesteps != self.num_timesteps:
             # A callback ended learn() before the last transition was stored: SB3 resets the environments.
             self._last_obs = None
-        if self.learning_starts in (None, self._default_learning_starts):
+        goes_on = not reset_num_timesteps and self._n_updates > 0
+        is_empty = not self.replay_buffer.size()  # type: ignore[union-attr]
+        if (is_empty or not goes_on) and self.learning_starts in (None, self._default_learning_starts):
             before = 0 if reset_num_timesteps else self.num_timesteps
             self.learning_starts = self._default_learning_starts = default_learning_starts(before + total_timesteps)
         if reset_num_timesteps:
             self._random_until = -1
-        elif self._n_updates and self.critic.norm == "batch" and not self.replay_buffer.size():  # type: ignore[union-attr]
+        elif goes_on and is_empty and self.critic.norm == "batch":
             # Batch norm forgets what it knows on a few transitions, or on those of one policy.
             self._random_until = self.num_timesteps + self.learning_starts
             logger.warning("the replay buffer is empty (load_replay_buffer): %d random steps come first", self.learning_starts)

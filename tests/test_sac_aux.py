@@ -537,8 +537,10 @@ def test_defaults_that_depend_on_run_and_actions() -> None:
     assert (model.learning_starts, model._n_updates) == (6, 54)  # a tenth of a short run
     assert model.learn(20)._n_updates == 54 + 18  # of each one
     assert model.learn(20, reset_num_timesteps=False)._n_updates == 54 + 18 + 20
+    model.learn(960, lambda *_: model.num_timesteps < 50, reset_num_timesteps=False)
+    assert model._n_updates == 54 + 18 + 20 + 9  # the more steps are to come, not the more random ones
     model.learning_starts = 30
-    assert model.learn(20)._n_updates == 54 + 18 + 20
+    assert model.learn(20)._n_updates == 54 + 18 + 20 + 9
     assert default_learning_starts(10**6) == 5000
     assert model.target_entropy == -1.0  # half of SAC's, which is -2 for two actions
 
