@@ -298,7 +298,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"imports": ["no_such_module"]}, "imports: no_such_module cannot be imported"),
     ({"environment": 3}, "environment: should be a valid string, not 3"),
     ({"environment": "dm_control/cheetah-rum-v0"}, "environment: unknown environment .*cheetah-run"),
-    ({"hyperparameters": "arl_state.yml"}, "hyperparameters: arl_state.yml is no file, .*nearest: aarl_state"),
+    ({"hyperparameters": "arl_state.yml"}, "hyperparameters: /.*/arl_state.yml is no file, .*nearest: aarl_state"),
     ({"checkpoints": 5}, "checkpoints: should be a list, not 5"),
     ({"checkpoints": []}, r"checkpoints: .*not \[\]"),
     ({"checkpoints": [800, 400]}, "checkpoints: must be environment steps in ascending order"),
