@@ -170,12 +170,12 @@ class Search:
         check_study(study, config)
         if SETTINGS_KEY not in study.user_attrs and any(trial.state != TrialState.WAITING for trial in study.trials):
             raise ValueError(f"study {study.study_name!r} is not this search: it has trials of another program. {ADVICE}")
-        sampler.progress(study)  # refuses a study with other settings of the sampler
         if SETTINGS_KEY not in study.user_attrs:
             matrix = baselines(config, self.folder)
             for cell, run in matrix.runs.items():
                 if (path := cell_folder(matrix.folder, cell)).exists():
                     prepare_run(path, run)  # refuses that of other settings, with which nothing could be compared
+        sampler.progress(study)  # refuses a study with other settings of the sampler
         if not has_driver(self.storage, config.name, self.folder):  # which has its own, such as more generations
             study.set_user_attr(SETTINGS_KEY, settings(config))
         return study

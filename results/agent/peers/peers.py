@@ -18,7 +18,7 @@ from sb3_aarl.callbacks import Evaluation, LearningCurveCallback, read_curve
 
 # RL-Zoo's for MuJoCo's tasks, but CrossQ has sb3-contrib's default width: 1024 instead of 2048, a third of the time.
 SETTINGS: dict[str, dict[str, Any]] = {"tqc": {"learning_starts": 10_000}, "crossq": {"learning_starts": 5_000}}
-HOPPER = {"tqc": {"top_quantiles_to_drop_per_net": 5}}
+TQC_ON_HOPPER = {"top_quantiles_to_drop_per_net": 5}
 ALGORITHMS: dict[str, type[TQC] | type[CrossQ]] = {"tqc": TQC, "crossq": CrossQ}
 FOLDER = Path(__file__).resolve().parent / "runs"
 
@@ -34,8 +34,8 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(1)
     algorithm, settings = ALGORITHMS[args.algorithm], SETTINGS[args.algorithm]
-    if args.env == "Hopper-v5":
-        settings |= HOPPER.get(args.algorithm, {})
+    if (args.algorithm, args.env) == ("tqc", "Hopper-v5"):
+        settings = settings | TQC_ON_HOPPER
     folder = args.folder / args.algorithm / args.env / f"seed-{args.seed}"
     folder.mkdir(parents=True, exist_ok=True)
     curve_file, model_file, buffer_file = (folder / name for name in ("curve.csv", "checkpoint.zip", "buffer.pkl"))
