@@ -147,12 +147,13 @@ class WindowReplayBuffer(ReplayBuffer):
 
     def _as_sb3(self, following: bool) -> Any:
         def read_only(part: th.Tensor) -> np.ndarray:
-            array = part.numpy()
-            array[self.size() :] = 0
+            array = np.zeros((self.buffer_size, *part.shape[1:]), part.numpy().dtype)
+            array[: self.size()] = part.numpy()
             array.flags.writeable = False
             return array
 
-        return map_parts(read_only, self.gather(np.arange(self.ages.size).reshape(self.ages.shape), following))
+        stored = np.arange(self.ages.size).reshape(self.ages.shape)[: self.size()]
+        return map_parts(read_only, self.gather(stored, following))
 
     def gather(
         self,

@@ -324,6 +324,7 @@ class SACAuxPolicy(SACPolicy):
         self.critic_target.requires_grad_(False)
         self.actor.optimizer = self.make_optimizer(self.actor.own_parameters(), lr_schedule)
         self.critic.optimizer = self.make_optimizer(list(self.critic.parameters()), lr_schedule)
+        self.set_training_mode(False)  # reading Q values before learn() changes no running statistics
 
     def make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
         """An optimizer of the policy's class and arguments."""

@@ -61,7 +61,8 @@ class SACAux(SAC):
         two have their own
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts; None (default, until ``learn``) for 5,000,
-        or a tenth of ``learn`` if that is less. One that goes on has none, or as many if the replay buffer is empty
+        or a tenth of ``learn`` if that is less. One that goes on has none; if the replay buffer is empty, as many, but no more
+        than the default
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 1 copies them at each update (no targets, as in CrossQ); 0 freezes
         the target critic's weights
@@ -223,7 +224,6 @@ class SACAux(SAC):
             logger.warning("precision='bf16': this %s has no instructions for it, training in fp32", self.device.type.upper())
         if self.compile:
             self._compile_losses()
-        self.policy.set_training_mode(False)  # reading Q values before learn() changes no running statistics
 
     def _setup_replay_buffer(self, buffer_class: type[WindowReplayBuffer]) -> None:
         if self.env is not None:
@@ -511,15 +511,17 @@ class SACAux(SAC):
             self._last_obs = None
         goes_on = not reset_num_timesteps and self._n_updates > 0
         is_empty = not self.replay_buffer.size()  # type: ignore[union-attr]
-        if (is_empty or not goes_on) and self.learning_starts in (None, self._default_learning_starts):
-            before = 0 if reset_num_timesteps else self.num_timesteps
-            self.learning_starts = self._default_learning_starts = default_learning_starts(before + total_timesteps)
+        default = default_learning_starts(total_timesteps + (0 if reset_num_timesteps or goes_on else self.num_timesteps))
+        is_default = self.learning_starts in (None, self._default_learning_starts)
+        if self.learning_starts is None or (is_default and (is_empty or not goes_on)):
+            self.learning_starts = self._default_learning_starts = default
         if reset_num_timesteps:
             self._random_until = -1
         elif goes_on and is_empty and self.critic.norm == "batch":
             # Batch norm forgets what it knows on a few transitions, or on those of one policy.
-            self._random_until = self.num_timesteps + self.learning_starts
-            logger.warning("the replay buffer is empty (load_replay_buffer): %d random steps come first", self.learning_starts)
+            n_random = min(self.learning_starts, default)
+            self._random_until = self.num_timesteps + n_random
+            logger.warning("the replay buffer is empty (load_replay_buffer): %d random steps come first", n_random)
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if self._n_updates and self._n_aux_skipped == self._n_updates:
             warnings.warn(f"aux_loss was never trained: no episode is as long as its horizon ({self.aux_loss})", stacklevel=2)
