@@ -279,6 +279,20 @@ def test_reports_the_mean_over_the_seeds_and_prunes(tmp_path: Path) -> None:
     assert pruned and complete
 
 
+def test_repeats_of_a_loss_are_not_pruned(tmp_path: Path) -> None:
+    """Of repeats that a pruner lets pass, the mean would be that of the lucky ones."""
+    executor, rng = Executor(), random.Random(0)
+    pruner = ThresholdPruner(lower=60)
+    search = start(tmp_path, executor, settings=AGAIN | {"n_generations": 8}, pruner=pruner)
+    for _ in search:
+        executor.evaluate()
+        while executor.pending:
+            executor.end(rng)
+    repeats = [trial for trial in search.study.trials if trial.user_attrs["operation"] == "again"]
+    assert {trial.state for trial in repeats} == {TrialState.COMPLETE}
+    assert any(min(trial.intermediate_values.values()) < 60 for trial in repeats)
+
+
 def test_pruners_act_between_environments(tmp_path: Path) -> None:
     executor, rng = Executor(), random.Random(0)
     search = start(tmp_path, executor, 2, TASKS, returns=TASKS, pruner=ThresholdPruner(lower=0.5))

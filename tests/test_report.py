@@ -1,5 +1,6 @@
 """The report of a study: parsed, and opened in a real browser."""
 
+import shutil
 from collections import Counter
 from datetime import datetime, timedelta
 
@@ -190,6 +191,9 @@ def test_baselines_and_cross_validation_are_read_from_their_folders(tmp_path):
     (failed / "failed.json").write_text('{"reason": "it burst", "retry": false}')
     for seed, score in ((0, 3.0), (1, 4.0), (2, None)):
         plant(tmp_path / "baselines", "SAC", "a", seed, score)
+    for seed, score in ((0, 9.0), (1, None)):
+        plant(tmp_path / "baselines", "CURL", "a", seed, score)
+    shutil.copy(failed / "failed.json", cell_folder(tmp_path / "baselines", Cell("CURL", "a", 1)))
     assert stored_baselines(tmp_path) == [("SAC", 3.5)] and stored_baselines(tmp_path / "nothing") == []
     validation = stored_scores(tmp_path / "cross-validation")
     found = validation.dropna()[["variant", "environment", "seed", "score"]].itertuples(index=False, name=None)

@@ -62,6 +62,7 @@ def compare(matrix: "Matrix", title: str) -> "pd.DataFrame":
     ranked = ranking(scores(matrix))
     if not ranked.empty:
         shown = ranked.map("{:.3f}".format).replace("nan", "-").assign(runs=ranked["runs"].map(str))
+        title += ", AULC: posterior mean, 95 % interval, probability to be the best"
         show_table(shown.rename(columns=task_name).reset_index(), title)
     return ranked
 
@@ -109,7 +110,7 @@ def baselines(
         search.check_study(load_study(searched.storage, settings.name), settings, free=("threads",))
     matrix = search.baselines(settings, searched.folder)
     train_matrix(matrix, execution, workers, settings.retries, config)
-    compare(matrix, "Baselines, AULC")
+    compare(matrix, "Baselines")
     exit_if_failed(matrix)
 
 
@@ -142,7 +143,7 @@ def cross_validate(
     searched = load_study(open_storage(path, storage, create=False), settings.name)
     matrix = cross_validation.make_matrix(settings, searched, path, settings.baselines if with_baselines else ())
     train_matrix(matrix, execution, workers, settings.retries, config, cross_validation.rounds(settings, matrix))
-    table = compare(matrix, "Cross-validation, AULC: posterior mean, 95 % interval, probability to be the best")
+    table = compare(matrix, "Cross-validation")
     names = [baseline.name for baseline in settings.baselines]
     if not (candidates := table.drop(index=names, errors="ignore")).empty:
         values = cross_validation.searched_values(settings, searched)

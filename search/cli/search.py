@@ -1,5 +1,6 @@
 """The command ``aarl search``: it wires configuration, storage, sampler, executor, driver and notes."""
 
+import shlex
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -45,17 +46,18 @@ def search(
     if dry_run:
         show_costs(planned_runs(settings), at_once)
         return
-    place = "" if storage is None else f" --storage {hide_password(storage)}"
+    place = [] if storage is None else ["--storage", hide_password(storage)]
     # The study is created after the executor, which may have a wrong address.
     with execution.start(at_once, path) as running:
-        say(f"Study {found.study.study_name}. To watch it: aarl dashboard {path}{place}")
+        say(f"Study {found.study.study_name}. To watch it: {shlex.join(['aarl', 'dashboard', str(path), *place])}")
         with live() as show:
             progress = found.run(running, at_once, lambda state: show(progress_line(state), state.generations))
     if progress.best is not None:
         say(f"Best: {progress.best_loss}, score {progress.best:.2f}")
         if settings.cross_validation:
-            place += "" if folder is None else f" --folder {folder}"
-            say(f"Does it hold with other seeds? aarl cross-validate {config}{place}{execution}")
+            place += [] if folder is None else ["--folder", str(folder)]
+            command = shlex.join(["aarl", "cross-validate", str(config), *place])
+            say(f"Does it hold with other seeds? {command}{execution}")
 
 
 def progress_line(progress: "SearchProgress") -> str:

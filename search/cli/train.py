@@ -121,6 +121,7 @@ def video(
     if path.suffix.lower() not in (".gif", ".mp4"):
         raise ValueError(f"--out: {path} must end in .gif or .mp4")
     returns = play(folder, 1, 0, frames)
+    frames.pop()  # of the next episode: the environment is reset before a picture is taken
     # GIF counts in milliseconds, and repeats.
     imageio.imwrite(path, frames, **({"duration": 1000 / FPS, "loop": 0} if path.suffix.lower() == ".gif" else {"fps": FPS}))
     say(f"Video: {path}, {len(frames)} pictures, return {returns[0]:.1f}")

@@ -128,8 +128,8 @@ class AuxLossSampler(Settings, BaseSampler):
     @staticmethod
     def seed_index(trial: Trial | FrozenTrial) -> int:
         """
-        Which seed a trial trains: k if ``again`` repeats its loss for the k-th time, else 0. Train other seeds for each; it is
-        the user attribute ``seed_index``.
+        Which seed a trial trains: k if ``again`` repeats its loss for the k-th time, else 0. Train other seeds for each, and
+        prune no repeat: only the lucky ones would count. It is the user attribute ``seed_index``.
         """
         return trial.user_attrs.get(SEED_INDEX_KEY, 0)
 

@@ -188,7 +188,7 @@ class Driver:
                 names = [task[0].run.environment for task in running.done]
                 self._note(trial, {"scores": dict(zip(names, of_tasks, strict=True))})
                 self._patiently(trial.report, score, len(of_tasks))
-            if running.waiting and not self._patiently(trial.should_prune):
+            if running.waiting and not self._is_pruned(trial):
                 self._submit(running)
                 return
             is_whole = not running.waiting
@@ -224,8 +224,12 @@ class Driver:
         for steps, mean in curve[running.n_reported :]:
             self._patiently(running.trial.report, mean, int(steps))
             running.n_reported += 1
-            if steps != running.jobs[0].run.checkpoints[-1] and self._patiently(running.trial.should_prune):
+            if steps != running.jobs[0].run.checkpoints[-1] and self._is_pruned(running.trial):
                 running.stop()
+
+    def _is_pruned(self, trial: optuna.Trial) -> bool:
+        """Whether the pruner ends a trial; never one of ``again``: of a loss's repeats only the lucky ones would count."""
+        return not AuxLossSampler.seed_index(trial) and self._patiently(trial.should_prune)
 
     def _fail(self, trial: optuna.Trial, reason: str) -> None:
         logger.warning("Trial %d failed: %s", trial.number, reason)
