@@ -210,7 +210,7 @@ def search_tables(folder: Path) -> Iterator[str]:
     trials = analysis.analysed(analysis.trial_table(study.get_trials(deepcopy=False)))
     yield from generation_tables(trials)
     best = trials.nlargest(BEST, "score").to_dict("records")
-    rows = [(row["number"], row["generation"], row["operation"], f"{row['score']:.0f}", f"`{row['loss']}`") for row in best]
+    rows = [(row["number"], row["generation"], row["operation"], score_text(row["score"]), f"`{row['loss']}`") for row in best]
     yield "## Best losses\n\n" + markdown([("trial", "generation", "operation", "score", "loss"), *rows])
     found = analysis.summary(study.get_trials(deepcopy=False))
     for name, title in ANALYSES.items():
@@ -235,19 +235,27 @@ def generation_tables(trials: pd.DataFrame) -> Iterator[str]:
         [("generation", "all", "evolved", "random"), *rows]
     )
     scores, others = evolved["score"].tolist(), random["score"].tolist()
-    best = [f"{mean_of_best(values, DRAWN):.0f}" for values in (scores, others)]
+    if min(len(scores), len(others)) < DRAWN:
+        return
+    best = [score_text(mean_of_best(values, DRAWN)) for values in (scores, others)]
     yield (
         f"The best of {DRAWN} evolved losses is {best[0]} on average, the best of {DRAWN} random ones {best[1]}; "
         f"Mann-Whitney's p of all is {mannwhitneyu(scores, others).pvalue:.1g}."
     )
 
 
+def score_text(score: float, largest: float | None = None) -> str:
+    """A score, with decimals where the largest is a share of a return."""
+    return f"{score:.{0 if (largest or score) > 10 else 3}f}"
+
+
 def scores_text(scores: list[float]) -> str:
     """Mean, standard error, number and best of scores."""
     if len(scores) < 2:
-        return ", ".join(f"{score:.0f}" for score in scores)
+        return ", ".join(map(score_text, scores))
     error = statistics.stdev(scores) / math.sqrt(len(scores))
-    return f"{statistics.mean(scores):.0f} ± {error:.0f} ({len(scores)}, {max(scores):.0f})"
+    mean, error_text, best = (score_text(score, max(scores)) for score in (statistics.mean(scores), error, max(scores)))
+    return f"{mean} ± {error_text} ({len(scores)}, {best})"
 
 
 def mean_of_best(scores: list[float], n: int) -> float:
