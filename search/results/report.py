@@ -27,8 +27,7 @@ N_BEST = 10
 
 def stored_baselines(folder: Path) -> list[tuple[str, float]]:
     """Name and mean score of the baselines with runs on all environments, none failed, from the folder of a search."""
-    runs = stored_scores(folder / "baselines")
-    runs = runs[~runs["variant"].isin(runs.loc[runs["score"].isna(), "variant"])]
+    runs = cross_validation.without_failed(stored_scores(folder / "baselines"))
     means = runs.pivot_table(index="variant", columns="environment", values="score").dropna().mean(axis=1)
     return [(str(name), float(score)) for name, score in means.items()]
 

@@ -120,6 +120,11 @@ def seed_scores(runs: pd.DataFrame, n_environments: int) -> pd.DataFrame:
     return groups.mean().where(groups.count() == n_environments).unstack()
 
 
+def without_failed(runs: pd.DataFrame) -> pd.DataFrame:
+    """The runs of the variants of which none failed."""
+    return runs[~runs["variant"].isin(runs.loc[runs["score"].isna(), "variant"])]
+
+
 def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The candidates, the best first, by what their runs say of the mean score over all seeds and environments (paper, A.4):
@@ -128,8 +133,7 @@ def ranking(runs: pd.DataFrame) -> pd.DataFrame:
     which no run is finished does not count.
     """
     runs = runs[runs.groupby("environment")["score"].transform("count") > 0]
-    failed = runs.loc[runs["score"].isna(), "variant"]
-    runs = runs[~runs["variant"].isin(failed)]
+    runs = without_failed(runs)
     by_seed = seed_scores(runs, runs["environment"].nunique())
     by_environment = runs.pivot_table(index="variant", columns="environment", values="score", aggfunc="mean")
     overall = pd.DataFrame(standings(by_seed.to_numpy())._asdict(), index=by_seed.index)
