@@ -32,18 +32,22 @@ def _choose_renderer() -> None:
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if "MUJOCO_GL" in os.environ or display or not sys.platform.startswith("linux"):
         return
-    for backend, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8")):
-        with contextlib.suppress(OSError):
-            ctypes.CDLL(library)
-            os.environ["MUJOCO_GL"] = backend
+    with contextlib.suppress(OSError):
+        get_display = ctypes.CDLL("libEGL.so.1").eglGetDisplay
+        get_display.restype = ctypes.c_void_p
+        if get_display(None):  # a null pointer without a driver
+            os.environ["MUJOCO_GL"] = "egl"
             return
+    with contextlib.suppress(OSError):
+        ctypes.CDLL("libOSMesa.so.8")
+        os.environ["MUJOCO_GL"] = "osmesa"
 
 
-_choose_renderer()
 # PyTorch's CUDA build imports triton at the first optimizer step. If Mesa is loaded by then, as it is with EGL in
 # software, the two copies of LLVM crash the process; in this order they do not.
 with contextlib.suppress(ImportError):
     import triton  # type: ignore[import-not-found]  # noqa: F401
+_choose_renderer()
 
 PREFIX = "dm_control/"
 NEEDS_DMC = (

@@ -222,7 +222,7 @@ class Critic(_CropsImages, ContinuousCritic):
         """The parameters of the encoder, collected once."""
         return list(self.features_extractor.parameters())
 
-    @cached_property
+    @property
     def running_statistics(self) -> list[th.Tensor]:
         """The running statistics themselves: SB3's ``batch_norm_stats`` are copies of them in a model that was pickled."""
         return [buffer for name, buffer in self.named_buffers() if "running_" in name]

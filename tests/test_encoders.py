@@ -241,6 +241,7 @@ def test_running_statistics_are_shared_saved_and_not_learnt_from_predictions(tmp
         return found[0]
 
     for steps in (11, 1, 1, 1):  # the target's parameters follow every fifth step, its statistics always
+        model.policy.double().float()  # replaces the tensors of statistics, as a move to a GPU does
         model.learn(steps, reset_num_timesteps=False)
         before = statistics(model)
     assert before[-1] > 0

@@ -197,6 +197,14 @@ def test_a_renderer_is_chosen_where_there_is_no_display(
     assert os.environ.get("MUJOCO_GL") in expected
 
 
+def test_states_need_no_driver_for_rendering() -> None:
+    """A library for EGL without a driver, such as conda's on a machine without a graphics card."""
+    code = "from sb3_aarl.envs import make_dmc_env; make_dmc_env('cheetah-run').reset()"
+    chosen = {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM"}
+    variables = {name: value for name, value in os.environ.items() if name not in chosen}
+    subprocess.run([sys.executable, "-c", code], env={**variables, "__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent"}, check=True)
+
+
 def test_deprecations_of_libraries_stay_hidden() -> None:
     """dm_control has Python show them all, each time, from its import on."""
     program = "import warnings; from sb3_aarl.envs import make_dmc_env; make_dmc_env('walker-walk')"
