@@ -10,7 +10,7 @@ import re
 import runpy
 import statistics
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ GUIDES = ("expect.md", "from_sac.md", "losses.md", "paper.md", "results.md")
 PAGES = [
     ROOT / "README.md",
     RESULTS / "README.md",
+    RESULTS / "agent/peers/about.md",
     RESULTS / "agent/proof/about.md",
     *(ROOT / "docs" / "guides" / name for name in GUIDES),
 ]
@@ -60,6 +61,7 @@ def texts() -> dict[Path, str]:
     tasks = [row for row in read["headline"].values() if isinstance(row[-1], int)]
     tables = {name: sentence(part, tasks) if isinstance(part, str) else readme_table(part) for name, part in read.items()}
     tables["shares"] = shares_table(tasks)
+    tables["peers"] = peers_table(RESULTS / "agent/peers/runs")
     abouts = sorted(RESULTS.glob("*/*/about.md"))
     tables["index"] = markdown([("experiment", "question", "answer"), *map(summary, abouts)])
     files = {path: filled(path.read_text(encoding="utf-8"), tables) for path in PAGES}
@@ -136,16 +138,44 @@ def shares_table(rows: Iterable[list[Any]]) -> str:
     return f"{markdown(table)}\n\n{text}"
 
 
+def peers_table(folder: Path) -> str:
+    """
+    Algorithms at 50,000 and 100,000 steps, and at the last evaluation within the time that SACAux takes for these, as the mean
+    of its runs. The first three seeds count, which ran when nothing but one more run did.
+    """
+    points = pd.concat(
+        pd.DataFrame(read_curve(path)).assign(task=path.parts[-3], algorithm=path.parts[-4], seed=path.parts[-2])
+        for path in sorted(folder.glob("*/*/seed-*/curve.csv"))
+    )
+    points = points[points["seed"].isin(["seed-50", "seed-51", "seed-52"])]
+    groups = ["task", "algorithm"]
+    at_steps, in_time, minutes = {}, {}, {}
+    for steps in (50_000, 100_000):
+        reached = points[points["environment_steps"] == steps]
+        limits = reached[reached["algorithm"] == "sac_aux"].groupby("task")["seconds"].mean()
+        last = points[points["seconds"] <= points["task"].map(limits)].groupby([*groups, "seed"]).tail(1)
+        at_steps[f"{steps:,} steps"] = reached.groupby(groups)["mean"].agg(returns_text)
+        in_time[f"in SACAux's time for {steps:,}"] = last.groupby(groups)["mean"].agg(returns_text)
+        minutes[f"minutes for {steps:,}"] = reached.groupby(groups)["seconds"].agg(
+            lambda seconds: f"{seconds.mean() / 60:.0f}"
+        )
+    return from_frame(pd.DataFrame(at_steps | in_time | minutes).fillna("-").reset_index())
+
+
 def last_returns(folder: Path) -> list[float]:
     """The last returns of the runs in a folder, one for each seed."""
     return [read_curve(path)[-1].mean for path in folder.glob("seed-*/curve.csv")]
 
 
 def returns(folder: Path) -> str:
-    """The last returns of the runs in a folder: mean, deviation, number."""
-    last = last_returns(folder)
-    deviation = f" ± {statistics.stdev(last):,.0f}" if len(last) > 1 else ""
-    return f"{statistics.mean(last):,.0f}{deviation} ({len(last)})"
+    """The last returns of the runs in a folder."""
+    return returns_text(last_returns(folder))
+
+
+def returns_text(values: Collection[float]) -> str:
+    """Mean, deviation and number of returns."""
+    deviation = f" ± {statistics.stdev(values):,.0f}" if len(values) > 1 else ""
+    return f"{statistics.mean(values):,.0f}{deviation} ({len(values)})"
 
 
 def summary(about: Path) -> tuple[str, str, str]:
