@@ -4,6 +4,7 @@ Write all tables of results: table.md of each experiment, the index in README.md
 Every number of a run comes from its curve.csv and provenance.json; tables.yml says which runs a table of a page shows.
 """
 
+import json
 import math
 import os
 import re
@@ -44,6 +45,8 @@ PROVED = {"SACAux": "sac_aux", "no loss": "no_loss", "SAC": "sac", "CrossQ": "cr
 # What a search does to losses; the others are drawn at random, from priors, or given.
 EVOLVED = ("crossover", "replacement", "horizon_change")
 DRAWN, BEST = 20, 10
+# Environment steps between the evaluations of a run.
+EVERY = 10_000
 # The tables of an analysis, and their titles.
 ANALYSES = {
     "table5": "Patterns: mean score with - without (table 5; Welch's t-test: * p < 0.05, ** p < 0.01)",
@@ -61,7 +64,11 @@ def texts() -> dict[Path, str]:
     tasks = [row for row in read["headline"].values() if isinstance(row[-1], int)]
     tables = {name: sentence(part, tasks) if isinstance(part, str) else readme_table(part) for name, part in read.items()}
     tables["shares"] = shares_table(tasks)
-    tables["peers"] = peers_table(RESULTS / "agent/peers/runs")
+    peers = RESULTS / "agent/peers"
+    tables["peers"] = peers_table(peers)
+    tables["step_times"] = markdown(
+        list(zip(*((name, f"{ratio:.2f}") for name, ratio in step_ratios(peers).items()), strict=True))
+    )
     abouts = sorted(RESULTS.glob("*/*/about.md"))
     tables["index"] = markdown([("experiment", "question", "answer"), *map(summary, abouts)])
     files = {path: filled(path.read_text(encoding="utf-8"), tables) for path in PAGES}
@@ -140,26 +147,30 @@ def shares_table(rows: Iterable[list[Any]]) -> str:
 
 def peers_table(folder: Path) -> str:
     """
-    Algorithms at 50,000 and 100,000 steps, and at the last evaluation within the time that SACAux takes for these, as the mean
-    of its runs. The first three seeds count, which ran when nothing but one more run did.
+    Algorithms at 50,000 and 100,000 steps, and at their last evaluation within the time that SACAux takes for these, if they
+    were trained so long.
     """
     points = pd.concat(
         pd.DataFrame(read_curve(path)).assign(task=path.parts[-3], algorithm=path.parts[-4], seed=path.parts[-2])
-        for path in sorted(folder.glob("*/*/seed-*/curve.csv"))
+        for path in sorted(folder.glob("runs/*/*/seed-*/curve.csv"))
     )
     points = points[points["seed"].isin(["seed-50", "seed-51", "seed-52"])]
+    slower = points["algorithm"].map(step_ratios(folder))
     groups = ["task", "algorithm"]
-    at_steps, in_time, minutes = {}, {}, {}
+    columns = {}
     for steps in (50_000, 100_000):
         reached = points[points["environment_steps"] == steps]
-        limits = reached[reached["algorithm"] == "sac_aux"].groupby("task")["seconds"].mean()
-        last = points[points["seconds"] <= points["task"].map(limits)].groupby([*groups, "seed"]).tail(1)
-        at_steps[f"{steps:,} steps"] = reached.groupby(groups)["mean"].agg(returns_text)
-        in_time[f"in SACAux's time for {steps:,}"] = last.groupby(groups)["mean"].agg(returns_text)
-        minutes[f"minutes for {steps:,}"] = reached.groupby(groups)["seconds"].agg(
-            lambda seconds: f"{seconds.mean() / 60:.0f}"
+        columns[f"{steps:,} steps"] = reached.groupby(groups)["mean"].agg(returns_text)
+        at = (steps / slower / EVERY).astype(int) * EVERY
+        columns[f"in SACAux's time for {steps:,}"] = (
+            points[points["environment_steps"] == at].groupby(groups)["mean"].agg(returns_text)
         )
-    return from_frame(pd.DataFrame(at_steps | in_time | minutes).fillna("-").reset_index())
+    return from_frame(pd.DataFrame(columns).fillna("-").reset_index())
+
+
+def step_ratios(folder: Path) -> dict[str, float]:
+    """What a step of each algorithm takes, SACAux's being 1."""
+    return json.loads((folder / "steps.json").read_text("utf-8"))["ratio"]
 
 
 def last_returns(folder: Path) -> list[float]:

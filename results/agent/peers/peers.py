@@ -1,7 +1,7 @@
 """
 Train an algorithm of sb3-contrib as `aarl benchmark` trains SACAux; the same command resumes it from its last evaluation.
 
-    python results/agent/peers/peers.py tqc Hopper-v5 --seed 30
+    python results/agent/peers/peers.py tqc Hopper-v5 --seed 30 --steps 120000
 """
 
 import argparse
@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("algorithm", choices=ALGORITHMS)
     parser.add_argument("env", help="id of a task of Gymnasium")
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--steps", type=int, required=True)
     parser.add_argument("--every", type=int, default=10_000)
     parser.add_argument("--folder", type=Path, default=FOLDER)
     args = parser.parse_args()
