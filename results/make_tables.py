@@ -194,7 +194,8 @@ def summary(about: Path) -> tuple[str, str, str]:
     text = " ".join(about.read_text(encoding="utf-8").split())
     parts = dict(re.findall(r"\*\*(Question|Answer)\.\*\* (.*?[.?])(?: |$)", text))
     name = about.parent.relative_to(RESULTS).as_posix()
-    return f"[{name}]({name}/about.md)", parts["Question"], parts["Answer"]
+    group = name.partition("/")[0]
+    return f"[{name}]({name}/about.md)", parts["Question"], parts["Answer"].replace("](../", f"]({group}/")
 
 
 def page(folder: Path, parts: Iterable[str]) -> str:

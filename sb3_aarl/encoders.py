@@ -25,7 +25,7 @@ class Encoder(BaseFeaturesExtractor, ABC):
     """
     An encoder in two parts: a trunk, and a projection (linear, layer norm) from it to the latent state.
 
-    The actor reads the trunk through a projection of its own, see ``policies.Actor``.
+    The actor reads the trunk through a projection of its own, see ``policies.DetachedEncoder``.
 
     :param observation_space: The observation space, one key's if it is a Dict
     :param features_dim: Width of the latent state
@@ -163,8 +163,8 @@ class SimbaEncoder(Encoder):
     observation, else through a projection of its own.
 
     :param observation_space: Any space that SB3 can flatten
-    :param features_dim: Width of the block, and of the latent state without the observation; 128 was slower
-        (results/agent/encoder_width)
+    :param features_dim: Width of the block, and of the latent state without the observation; 128 had lower
+        returns (results/agent/encoder_width)
     :param normalize: Whether observations are normalised; VecNormalize would do the same before
     :param observation: Whether the latent state contains the (normalised) observation beside the output of the block
     """
@@ -217,7 +217,7 @@ class MultiInputEncoder(Encoder):
 
     :param observation_space: Dict of images and of anything that SB3 can flatten
     :param cnn_output_dim: Width of each image's latent state (table 7: 50; the name is SB3's CombinedExtractor's)
-    :param mlp_output_dim: Width of the other keys' latent state
+    :param mlp_output_dim: ``features_dim`` of the other keys' encoder
     :param normalized_image: Whether images are floats already, as in SB3's CombinedExtractor
     :param vector_encoder: Encoder of the other keys: ``"simba"``, ``"dense_mlp"`` or ``"mlp"``
     """

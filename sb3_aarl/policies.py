@@ -239,7 +239,7 @@ class SACAuxPolicy(SACPolicy):
     :param features_extractor_class: The encoder: a name of ``encoders.ENCODERS`` or a class
     :param features_extractor_kwargs: Its keyword arguments; of a network among them each encoder gets a copy
     :param share_features_extractor: True (default, CURL's pixel agent): the actor reads the critic's encoder
-        detached, through a projection of its own. False: it has an encoder of its own, which the actor loss trains
+        detached, through a projection of its own if that has one. False: it has its own encoder, which the actor loss trains
     :param augmentation: What training does to images: ``"random_shift"`` by up to 4 pixels (DrQ), ``"random_crop"`` to
         ``crop_size`` with a centre crop elsewhere (CURL, paper), ``"none"``, or ``"auto"``: crop where ``crop_size`` is
         given, else shift. Vectors are never augmented
@@ -247,7 +247,7 @@ class SACAuxPolicy(SACPolicy):
     :param squash_log_std: None (default, SB3): the log standard deviation is clipped to [-20, 2]. Bounds such as
         (-10, 2) (the public reference): tanh squashes it into them; gSDE ignores them
     :param ortho_init: Whether all linear layers of actor and critic, outputs too, start orthogonal with zero biases
-        (CURL, the reference) or as PyTorch has it (default, SB3). Encoders always start orthogonal
+        (CURL, the reference) or as PyTorch has it (default, SB3). This package's encoders always do
     :param critic_norm: ``"batch"`` (default): batch norm in the Q networks, and both states of a transition in one batch
         (CrossQ, Bhatt et al., 2024); rewards divided by their mean magnitude in the first batch if that is above 1;
         ``"layer"``: layer norm in them; None (SB3)

@@ -61,8 +61,8 @@ class SACAux(SAC):
         two have their own
     :param buffer_size: Size of the replay buffer in transitions (agent steps)
     :param learning_starts: Agent steps with random actions before learning starts; None (default, until ``learn``) for 5,000,
-        or a tenth of ``learn`` if that is less. One that goes on has none; if the replay buffer is empty, as many, but no more
-        than the default
+        or a tenth of ``learn`` if that is less. A model that goes on has none, or, if its replay buffer is empty, as many, but
+        no more than the default
     :param batch_size: Transitions for each critic and actor update
     :param tau: Polyak coefficient of the target Q networks; 1 copies them at each update (no targets, as in CrossQ); 0 freezes
         the target critic's weights

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import paper_figures
 import paper_tables
 import pytest
@@ -21,9 +22,13 @@ from sb3_aarl.search.training.config import load_hyperparameters
 from sb3_aarl.search.training.folder import read_outcome
 from sb3_aarl.search.training.provenance import ABOUT, read_about, write_about
 from sb3_aarl.search.training.run import prepare_run, train
+from sb3_aarl.search.training.setup import Setup
+from sb3_aarl.search.training.shipped import DEFAULTS
+from stable_baselines3.common.envs import FakeImageEnv
 from tiny import YAML
 
 from sb3_aarl.callbacks import Evaluation, aulc, read_curve, write_curve
+from sb3_aarl.policies import CnnPolicy
 
 ZOO = Path(__file__).parent.parent / "zoo_configs"
 OWN = YAML.replace("default:", "Pendulum-v1:\n  aux_loss: curl\n  n_timesteps: 400")
@@ -91,6 +96,16 @@ def test_evaluations_in_between_are_no_checkpoints() -> None:
         about = matrix.abouts[cell]
         assert (about["checkpoints"], about["evaluations"]) == ([120, 400], [100, 120, 200, 300, 400])
         assert about["hyperparameters"] == load_hyperparameters("mine.yml", ENV)
+
+
+def test_the_defaults_take_the_policy_that_fits_the_observations() -> None:
+    gym.register("Picture-v0", lambda: FakeImageEnv(2, 32, 32, discrete=False))
+    Path("base.yml").write_text("base: sac_aux\nvariants: {based: {}}\n")
+    runs = load("base.yml", environments=["Picture-v0"]).runs | load(str(DEFAULTS), environments=["Picture-v0"]).runs
+    assert len(runs) == 2
+    for run in runs.values():
+        setup = Setup(run, "")
+        assert setup.model(setup.training_env()).policy_class is CnnPolicy
 
 
 BETWEEN = r"multiples of 4 \(.*action repeat\), "

@@ -262,6 +262,7 @@ PENDULUM = {"environment": "Pendulum-v1", "returns": [-1500, -100]}
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"populaton_size": 3}, "populaton_size: unknown key, .*'population_size'"),
     ({"cross_validation": {"environments": ["Pendulum-v1"], "sedes": [1]}}, "cross_validation.sedes: .*'seeds'"),
+    ({"cross_validation": {"seeds": [1, 2], "top": 3, "budget": 5}}, "cross_validation.budget: must be at least 6"),
     ({"environments": [PENDULUM]}, "environment: set either environment or environments"),
     ({"environment": None, "environments": [{"environment": "Pendulum-v1"}]}, r"environments\[0\].returns: is missing"),
     ({"environment": None, "environments": [PENDULUM | {"returns": [3, 3]}]}, r"environments\[0\].returns: must be .*not \[3"),

@@ -232,6 +232,16 @@ def test_initial_losses_are_the_first_slots() -> None:
     assert filled_slots(run(named)) == all_slots(2, 12, 3)
 
 
+def test_processes_that_ask_at_the_same_moment_get_different_slots() -> None:
+    study = make_study()
+    for _ in range(2):  # two others have their trials, and no slots yet
+        study._storage.create_new_trial(study._study_id)
+    last, others = study.ask(), study.get_trials()[:2]
+    for trial in others:
+        AuxLossSampler(**SMALL).before_trial(study, trial)
+    assert [key_of(trial) for trial in (*others, last)] == [(1, 0, 0), (1, 1, 0), (1, 2, 0)]
+
+
 @pytest.mark.parametrize("screening", [1, 4])
 def test_a_tiny_space_ends_with_duplicates_rather_than_not_at_all(screening: int) -> None:
     study = run(make_study(population_size=4, n_random=170, n_prior=10, max_horizon=1, n_generations=2, screening=screening))
@@ -795,6 +805,7 @@ def test_a_study_does_not_resume_with_other_settings(name: str, value: Any) -> N
         ({"parent_selection": "mean"}, "parent_selection must be best or posterior, not 'mean'"),
         ({"operators": ("l2",)}, "'l2' is not"),
         ({"seed": -1}, "seed must be at least 0"),
+        ({"seed": 1.5}, "seed must be a whole number, not 1.5"),
         ({"initial": [WANTED], "operators": ["inner"]}, "not in the space"),
         ({"initial": [AuxLoss.parse("{s_t} -> {s_t+3}")], "max_horizon": 2}, "longer than 2"),
     ],

@@ -213,6 +213,16 @@ def test_an_error_that_is_not_of_an_enqueued_value_is_raised() -> None:
         suggest_aux_loss(study.ask(), 1, ["mse", "cosine"])
 
 
+@pytest.mark.parametrize(
+    ("asked", "culprit"),
+    [({"max_horizon": 2}, "max_horizon=3, not 2"), ({"operators": ["inner"]}, "operators=None, not .'inner")],
+)
+def test_a_space_that_the_sampler_does_not_search_is_refused(asked: dict[str, Any], culprit: str) -> None:
+    study = optuna.create_study(sampler=AuxLossSampler(max_horizon=3, seed=0))
+    with pytest.raises(ValueError, match=culprit):
+        suggest_aux_loss(study.ask(), **asked)
+
+
 @pytest.mark.parametrize(("operators", "culprit"), [(("mse", "l1"), "l1"), ("mse", "mse"), ((), r"\(\)")])
 def test_unknown_operators_are_named(operators: tuple[str, ...] | str, culprit: str) -> None:
     with pytest.raises(ValueError, match=culprit):

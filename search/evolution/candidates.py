@@ -65,6 +65,8 @@ class Settings:
         for name, low in least.items():
             if (number := getattr(self, name)) is not None and not number >= low:
                 raise ValueError(f"{name} must be at least {low}, not {number}")
+            if name not in (*shares, "again") and not isinstance(number, int | None):
+                raise ValueError(f"{name} must be a whole number, not {number}")
         if not (self.n_random or self.n_prior or self.initial):
             raise ValueError("n_random, n_prior and initial must not all be empty")
         if abs(sum(shares.values()) - 1) > 1e-9:

@@ -63,7 +63,7 @@ class AuxLossSampler(Settings, BaseSampler):
 
     Asking never waits. A trial that finds no free slot gets an extra one, as the next generation would have it, so that
     no generation waits for trials that a killed process left RUNNING. Two processes that ask at the same moment may train one
-    slot's loss twice; the trial that finishes first counts.
+    slot's loss twice; the trial that finishes first counts. ``Study.add_trial`` fills no slot: pass ``initial`` instead.
 
     :param population_size: Slots of every generation but the first (paper: 100)
     :param n_random: Random losses of the first generation (paper: 100)
@@ -89,7 +89,8 @@ class AuxLossSampler(Settings, BaseSampler):
         seed (:meth:`seed_index`): by Thompson sampling, one that could be the best. The other shares divide the rest
     :param climbing: At most so many tokens are added to the offspring of a slot or removed, 0 for the paper's evolution: each
         time the one that most raises the model's mean and a multiple, drawn for each slot, of its deviation
-    :param independent_sampler: For parameters beside those of the loss, instead of inheritance
+    :param independent_sampler: For parameters beside those of the loss, instead of inheritance, such as ``TPESampler``. One
+        that draws all parameters together, such as ``GPSampler``, draws at random here
     :raises ValueError: naming the argument that does not fit
     """
 
@@ -241,6 +242,7 @@ class _Slots:
         self.sign = sign
         self.n_trials = 0
         self.unfinished: list[int] = []  # numbers of trials
+        self.asking: list[int] = []  # numbers of trials that have no slot yet
         self.last_started = 1
         self.running: set[tuple[int, int]] = set()  # generation and slot
         self.results: defaultdict[int, dict[int, Result | None]] = defaultdict(dict)  # None where a trial has no loss
@@ -254,6 +256,7 @@ class _Slots:
         self.n_trials = len(trials)
         self.unfinished = [trial.number for trial in changed if not trial.state.is_finished()]
         self.running.clear()
+        self.asking.clear()
         finished = []
         for trial in changed:
             key = trial.system_attrs.get(SLOT_KEY)
@@ -264,6 +267,8 @@ class _Slots:
                     finished.append((trial.datetime_complete, trial.number, at))
                 elif trial.state == TrialState.RUNNING:
                     self.running.add(at)
+            elif key is None and trial.state == TrialState.RUNNING and not trial.params:
+                self.asking.append(trial.number)
         for _, number, at in sorted(finished):
             self._finish(trials[number], *at)
 
@@ -309,6 +314,9 @@ class _Slots:
     def assign(self, number: int, fixed: Collection[str]) -> dict[str, Any]:
         """The system attributes of the trial of this number, which is asked for and has these parameters already."""
         free, is_enqueued = self.free(), not self.sampler._space.keys().isdisjoint(fixed)
+        # Other processes ask too, and will take the slots before.
+        n_before = sum(other < number for other in self.asking)
+        free = free[min(n_before, max(0, len(free) - 1)) :]
         if fixed:  # an interrupted slot keeps its parameters
             free = [at for at in free if at not in self.interrupted]
         if is_enqueued:  # no offspring is lost, if that can be

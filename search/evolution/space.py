@@ -126,28 +126,29 @@ def loss_of(trial: FrozenTrial) -> AuxLoss | None:
         return None
 
 
-def suggest_aux_loss(trial: BaseTrial, max_horizon: int = MAX_HORIZON, operators: Sequence[str] | None = None) -> AuxLoss:
+def suggest_aux_loss(trial: BaseTrial, max_horizon: int | None = None, operators: Sequence[str] | None = None) -> AuxLoss:
     """
     Suggest the parameters of a loss, with any sampler of Optuna. A trial that has them already, such as ``study.best_trial``,
-    returns its loss. AuxLossSampler has its own space.
+    returns its loss. AuxLossSampler has its own space: these arguments may be left out.
 
-    :param max_horizon: Longest horizon of the space
+    :param max_horizon: Longest horizon of the space; None for 10
     :param operators: Operators to search too, with and without negatives; None for mean squared error without
+    :raises ValueError: when an AuxLossSampler searches another space, naming the argument
     :raises optuna.TrialPruned: when what the sampler proposes, or a user enqueued, is not valid; nothing was trained then
     """
     check_operators(operators)
     if isinstance(trial, FrozenTrial) and "horizon" in trial.params:
         return _loss_or_pruned(trial.params)
-    has_slot, max_horizon, operators = _space_of(trial, max_horizon, operators)
-    params: dict[str, Any] = {"horizon": trial.suggest_int("horizon", 1, max_horizon)}
+    has_slot, longest, searched = _space_of(trial, max_horizon, operators)
+    params: dict[str, Any] = {"horizon": trial.suggest_int("horizon", 1, longest)}
     if not has_slot:  # the sampler is another one, perhaps with an AuxLossSampler as its independent_sampler
-        _, max_horizon, operators = _space_of(trial, max_horizon, operators)
-    if params["horizon"] > max_horizon and isinstance(trial, optuna.Trial):
-        raise optuna.TrialPruned(f"horizon is {params['horizon']}, longer than {max_horizon}")
-    for name, distribution in distributions(params["horizon"], max_horizon, operators).items():
+        _, longest, searched = _space_of(trial, max_horizon, operators)
+    if params["horizon"] > longest and isinstance(trial, optuna.Trial):
+        raise optuna.TrialPruned(f"horizon is {params['horizon']}, longer than {longest}")
+    for name, distribution in distributions(params["horizon"], longest, searched).items():
         if isinstance(distribution, CategoricalDistribution):
             params[name] = trial.suggest_categorical(name, distribution.choices)
-    if operators is None and isinstance(trial, FixedTrial):
+    if searched is None and isinstance(trial, FixedTrial):
         with contextlib.suppress(ValueError):  # it has no operator
             params["operator"] = trial.suggest_categorical("operator", OPERATORS)
             params["negatives"] = trial.suggest_categorical("negatives", [False, True])
@@ -161,18 +162,28 @@ def _loss_or_pruned(params: Mapping[str, Any]) -> AuxLoss:
         raise optuna.TrialPruned(str(error)) from None
 
 
-def _space_of(trial: BaseTrial, max_horizon: int, operators: Sequence[str] | None) -> tuple[bool, int, Sequence[str] | None]:
+def _space_of(
+    trial: BaseTrial, max_horizon: int | None, operators: Sequence[str] | None
+) -> tuple[bool, int, Sequence[str] | None]:
     """
     Whether an AuxLossSampler has given the trial its slot, and the space of that sampler, else the arguments. It is not read
     from ``study.sampler``, which may be a sampler around that one.
     """
+    longest = MAX_HORIZON if max_horizon is None else max_horizon
     if not isinstance(trial, optuna.Trial):
-        return True, max_horizon, operators
+        return True, longest, operators
     attributes = trial.study.get_trials(deepcopy=False)[trial.number].system_attrs
-    slot = attributes.get(SLOT_KEY, {})
-    max_horizon, operators = slot.get("max_horizon", max_horizon), slot.get("operators", operators)
-    _check_enqueued(attributes.get("fixed_params", {}), max_horizon, operators)
-    return SLOT_KEY in attributes, max_horizon, operators
+    if (slot := attributes.get(SLOT_KEY)) is not None:
+        longest, searched = slot["max_horizon"], slot["operators"]
+        if max_horizon not in (None, longest):
+            raise ValueError(
+                f"the AuxLossSampler has max_horizon={longest}, not {max_horizon}: leave it out, or change it there"
+            )
+        if operators is not None and list(operators) != list(searched or ()):
+            raise ValueError(f"the AuxLossSampler has operators={searched}, not {operators}: leave it out, or change it there")
+        operators = searched
+    _check_enqueued(attributes.get("fixed_params", {}), longest, operators)
+    return slot is not None, longest, operators
 
 
 def _check_enqueued(enqueued: Mapping[str, Any], max_horizon: int, operators: Sequence[str] | None) -> None:

@@ -15,6 +15,7 @@ from sb3_aarl.search.training.config import (
     entry_of,
     import_modules,
     merge,
+    read_entries,
     read_yaml,
     resolve_env_id,
     validated,
@@ -58,12 +59,12 @@ class Variant(NamedTuple):
 
 def read_variants(path: Path) -> list[Variant]:
     """The variants in a file: those of a ``variants.yml``, or one with the name of a file of hyper-parameters."""
-    entries = read_yaml(path)
+    entries = read_entries(path)
     if "variants" not in entries:
         return [Variant(path.stem, path, entries, str(path))]
     experiment = validated(Experiment, entries, str(path))
     base = experiment.base
-    entries = read_yaml(find_file(Path(base), folder=path.parent)) if isinstance(base, str) else base
+    entries = read_entries(find_file(Path(base), folder=path.parent)) if isinstance(base, str) else base
     return [
         Variant(name, path, {env_id: merge(entry or {}, changes) for env_id, entry in entries.items()}, f"{path}: {name}")
         for name, changes in experiment.variants.items()

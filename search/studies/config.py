@@ -26,7 +26,7 @@ from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.evolution.space import MAX_HORIZON, loss_to_params
 from sb3_aarl.search.training import config as training
 from sb3_aarl.search.training.config import ConfigError, check_checkpoints
-from sb3_aarl.search.training.shipped import find_file
+from sb3_aarl.search.training.shipped import DEFAULTS, find_file
 
 from sb3_aarl import catalog
 from sb3_aarl.aux_loss import AuxLoss
@@ -119,6 +119,14 @@ class CrossValidation(BaseModel, frozen=True, extra="forbid"):
     checkpoints: dict[Environment, Checkpoints] = {}
     returns: dict[Environment, Returns] = {}
     budget: PositiveInt | None = None
+
+    @field_validator("budget")
+    @classmethod
+    def _enough(cls, budget: int | None, info: ValidationInfo) -> int | None:
+        n_losses, seeds = info.data.get("top", 0) + info.data.get("top_rated", 0), info.data.get("seeds", ())
+        if budget is not None and budget < n_losses * len(seeds):
+            raise ValueError(f"must be at least {n_losses * len(seeds)}: {n_losses} losses with {len(seeds)} seeds each")
+        return budget
 
 
 class Baseline(BaseModel, frozen=True, extra="forbid"):
@@ -256,13 +264,10 @@ class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
         return dict(self._checked[key])
 
     def _entry(self, environment: str) -> dict[str, Any]:
-        file = self.hyperparameters or find_file(Path("sac_aux"))
+        file = self.hyperparameters or DEFAULTS
         if not self._file:
-            self._file.update(training.read_yaml(file))
-        entry = training.entry_of(self._file, environment, str(file))
-        if self.hyperparameters is None:
-            entry.pop("policy", None)  # the one that fits the observations
-        return entry
+            self._file.update(training.read_entries(file))
+        return training.entry_of(self._file, environment, str(file))
 
     def sampler_settings(self) -> dict[str, Any]:
         """The arguments of ``AuxLossSampler``, the number of generations included."""

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import count, islice, product
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def make_matrix(config: SearchConfig, study: optuna.Study, folder: Path, baselin
     candidates = [Baseline(name=str(loss), aux_loss=loss, overrides=merge_space({}, values[loss])) for loss in losses]
     # Those that race may have more seeds.
     n_more = section.budget - len(section.seeds) if section.budget else 0
-    more = range(max(section.seeds) + 1, max(section.seeds) + 1 + n_more)
+    more = islice((seed for seed in count(max(section.seeds) + 1) if seed not in config.seeds), n_more)
     variants = [*candidates, *baselines]
     cells = [
         Cell(variant.name, environment, seed)
@@ -103,6 +103,8 @@ def rounds(config: SearchConfig, matrix: Matrix) -> Iterator[Matrix]:
         table = seed_scores(scores(matrix), len(environments)).reindex(index=names, columns=list(seeds))
         spent = int(table.loc[sorted(failed)].count().sum())
         found = next_runs(table.loc[racing].to_numpy(), section.budget - spent, len(section.seeds))
+        # Without those that failed, other losses would have had the seeds: what is trained is spent.
+        found = found[: max(0, section.budget - int(table.count().sum()))]
         chosen = {(racing[row], list(seeds)[column]) for row, column in found}
         cells = [cell for cell in matrix.runs if (cell.variant, cell.seed) in chosen or cell in waiting]
         if not cells:

@@ -9,14 +9,15 @@ from sb3_aarl.search.training.config import (
     ConfigError,
     action_repeat,
     checkpoint_interval,
+    entry_of,
     import_modules,
-    load_hyperparameters,
+    read_entries,
     resolve_env_id,
     spread_checkpoints,
 )
 from sb3_aarl.search.training.folder import Run, prepare_run
 from sb3_aarl.search.training.setup import check_run
-from sb3_aarl.search.training.shipped import find_file
+from sb3_aarl.search.training.shipped import DEFAULTS, find_file
 
 from sb3_aarl import catalog
 from sb3_aarl.envs import PREFIX
@@ -40,10 +41,8 @@ def prepare_one(
     """
     import_modules(imports)
     environment = resolve_env_id(environment)
-    file = find_file(Path(hyperparams or "sac_aux"))
-    hyperparameters = load_hyperparameters(file, environment)
-    if hyperparams is None:
-        hyperparameters.pop("policy", None)  # the one that fits the observations
+    file = find_file(Path(hyperparams or DEFAULTS))
+    hyperparameters = entry_of(read_entries(file), environment, str(file))
     from_file = hyperparameters.pop("aux_loss", "auto")
     named = loss = from_file if aux_loss is None else aux_loss
     if loss in (None, "none"):

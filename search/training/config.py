@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args
 
 import gymnasium as gym
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError, create_model
+from sb3_aarl.search.training.shipped import DEFAULTS
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -40,6 +41,14 @@ def load_hyperparameters(path: str | Path, env_id: str) -> dict[str, Any]:
     :raises ConfigError: naming the file and the key that is wrong
     """
     return entry_of(read_yaml(path), env_id, str(path))
+
+
+def read_entries(path: Path) -> dict[str, Any]:
+    """Hyper-parameters by environment. Those of SACAux's defaults name no policy: it is the one that fits the observations."""
+    entries = read_yaml(path)
+    if not path.samefile(DEFAULTS):
+        return entries
+    return {env_id: {key: value for key, value in entry.items() if key != "policy"} for env_id, entry in entries.items()}
 
 
 def entry_of(entries: Mapping[str, Any], env_id: str, source: str) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 ZOO = Path(str(files("sb3_aarl.zoo_configs")))
 SEARCHES = ZOO / "search"
+DEFAULTS = ZOO / "sac_aux.yml"
 
 
 def find_file(path: Path, searches: bool = False, folder: Path = Path()) -> Path:
