@@ -1,7 +1,7 @@
 """AuxLoss: what an auxiliary loss predicts from what, as one immutable value, and its notation."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any, NamedTuple
@@ -49,7 +49,7 @@ class AuxLoss:
 
     The masks select tokens of the sequence (s_t, a_t, r_t, s_{t+1}, ..., s_{t+k}), k being the horizon: the state at
     offset i has index 3i, the action 3i + 1, the reward 3i + 2. The value is frozen, hashable and picklable;
-    ``yaml.safe_dump`` writes it as the mapping of :meth:`to_dict`.
+    ``yaml.safe_dump`` writes it as its notation.
 
     :param horizon: Number of agent steps k that the sequence spans, from 1 to 1000
     :param source: 3k + 1 booleans, what the prediction is made from (at least one state, paper A.3)
@@ -166,24 +166,10 @@ class AuxLoss:
         source, target = ((mask[first:] + (False,) * 3)[: 3 * horizon + 1] for mask in (self.source, self.target))
         return AuxLoss(horizon, source, target, self.operator, self.negatives)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for YAML and JSON; ``AuxLoss.from_dict`` reads them."""
-        notation = str(self).partition(" [")[0]
-        return {"loss": notation, "horizon": self.horizon, "operator": self.operator, "negatives": self.negatives}
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "AuxLoss":
-        """The loss of :meth:`to_dict`; all but ``loss`` (the notation) may be left out."""
-        unknown = set(values) - {"loss", "operator", "negatives", "horizon"}
-        if unknown or not isinstance(values.get("loss"), str):
-            problem = f"unknown key {min(map(str, unknown))!r}" if unknown else "no notation under 'loss'"
-            raise ValueError(f"{problem}: the keys of an auxiliary loss are loss (its notation), operator, negatives, horizon")
-        return cls.parse(**{"text" if key == "loss" else key: value for key, value in values.items()})
-
-
-# Configurations are plain YAML: a loss is written as a mapping, never as a Python object.
+# Configurations are plain YAML: a loss is written as its notation, never as a Python object.
 for _dumper in (yaml.SafeDumper, yaml.Dumper):
-    _dumper.add_representer(AuxLoss, lambda dumper, loss: dumper.represent_dict(loss.to_dict()))
+    _dumper.add_representer(AuxLoss, lambda dumper, loss: dumper.represent_str(str(loss)))
 
 
 def _checked_horizon(horizon: Any) -> int:

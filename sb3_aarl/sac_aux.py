@@ -1,7 +1,6 @@
 """SACAux: Soft Actor-Critic whose encoder is also trained with an auxiliary loss."""
 
 import copy
-import io
 import logging
 import math
 import warnings
@@ -132,7 +131,7 @@ class SACAux(SAC):
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
-        aux_loss: AuxLoss | str | Path | Mapping[str, Any] | None = "auto",
+        aux_loss: AuxLoss | str | Path | None = "auto",
         aux_kwargs: dict[str, Any] | None = None,
         policy_delay: int = 3,
         ent_coef_optimizer_kwargs: dict[str, Any] | None = None,
@@ -562,13 +561,6 @@ class SACAux(SAC):
         for name, value in state["counters"].items():
             setattr(self, name, value)
         self._q_value_check = QValueCheck(**state["q_value_check"])
-
-    def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        replay_buffer = vars(self).get("replay_buffer")
-        super().load_replay_buffer(path, truncate_last_traj)
-        if self.aux_loss is not None and not isinstance(self.replay_buffer, WindowReplayBuffer):
-            name, self.replay_buffer = type(self.replay_buffer).__name__, replay_buffer
-            raise ValueError(f"{name} has no windows, which aux_loss={self.aux_loss} needs: only aux_loss=None can load it")
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"

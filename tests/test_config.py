@@ -159,7 +159,7 @@ def test_files_are_relative_to_the_file_that_names_them(tmp_path: Path, monkeypa
 
 def test_a_search_may_start_from_given_losses(tmp_path: Path) -> None:
     (tmp_path / "winner.yml").write_text("aux_loss: '{s_t} -> {r_t}'")
-    published = tuple(candidate.loss for candidate in catalog.published())
+    published = tuple(catalog.published().values())
 
     def initial(value: Any, **keys: Any) -> tuple[AuxLoss, ...]:
         return load_config(write(tmp_path, CONFIG | {"initial": value} | keys)).sampler_settings()["initial"]
@@ -175,7 +175,7 @@ def test_a_search_may_start_from_given_losses(tmp_path: Path) -> None:
     assert catalog.load("curl") in initial("handcrafted", operators=["mse", "bilinear"])
     assert initial(["{s_t} -> {r_t}", "forward-dynamics"]) == (REWARD, FORWARD)
     assert initial("winner.yml") == initial("{s_t} -> {r_t}") == (REWARD,)
-    assert initial(["winner.yml", REWARD.to_dict(), "published"]) == (REWARD, REWARD, *published)
+    assert initial(["winner.yml", "published"]) == (REWARD, *published)
 
 
 def test_imported_modules_may_register_environments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,11 +334,8 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("change", "message"), WRONG, ids=[str(change)[:60] for change, _ in WRONG])
-def test_one_clear_line_for_a_problem(tmp_path: Path, change: dict[str, Any], message: str | None) -> None:
+def test_one_clear_line_for_a_problem(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     path = write(tmp_path, CONFIG | change)
-    if message is None:
-        load_config(path)
-        return
     with pytest.raises(ConfigError) as error:
         load_config(path)
     text = str(error.value)

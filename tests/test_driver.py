@@ -204,13 +204,6 @@ def test_a_database_that_another_program_holds_is_tried_again(tmp_path: Path, mo
     assert len(tries) == 1
 
 
-def test_a_second_driver_is_refused(tmp_path: Path) -> None:
-    running = iter(start(tmp_path, Executor()))
-    next(running)
-    with pytest.raises(ValueError, match="another program runs this search"):
-        next(iter(start(tmp_path, Executor())))
-
-
 def test_a_failed_candidate_makes_room_for_another_one(tmp_path: Path) -> None:
     executor, rng = Executor(), random.Random(0)
     search = start(tmp_path, executor)
@@ -221,18 +214,6 @@ def test_a_failed_candidate_makes_room_for_another_one(tmp_path: Path) -> None:
     assert (failed.state, failed.user_attrs["reason"]) == (TrialState.FAIL, "the loss is nan")
     assert loss_of(other) != loss_of(failed)
     assert (other.user_attrs["slot"], other.user_attrs["attempt"]) == (failed.user_attrs["slot"], 1)
-
-
-def test_failures_without_end_end_the_search(tmp_path: Path) -> None:
-    executor, rng = Executor(), random.Random(0)
-
-    def run() -> None:
-        for _ in start(tmp_path, executor, retries=1):
-            while executor.pending:
-                executor.end(rng, "no space left on device", retry=True)
-
-    with pytest.raises(RunFailed, match="10 candidates failed in a row, the last one: no space left"):
-        run()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

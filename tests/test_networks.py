@@ -73,13 +73,3 @@ def test_batch_norm_sees_both_states_in_both_critics() -> None:
     now, later = th.stack(values)[:2, :16], th.stack(values)[2:, 16:]
     wanted = batch.rewards[:, 0] + 0.9 * (1 - batch.dones[:, 0]) * (later.amin(0) - ent_coef * next_log_prob)
     th.testing.assert_close(loss, 0.5 * (now - wanted).pow(2).mean(1).sum())
-
-
-def test_a_look_at_q_values_changes_nothing() -> None:
-    model = make_model(policy_kwargs={"features_extractor_class": "simba", "features_extractor_kwargs": {"features_dim": 8}})
-    model.learn(30)  # which leaves the policy in training mode
-    before, batch = everything(model), model.replay_buffer.sample(16)
-    with th.no_grad():
-        q_values = model.critic(batch.observations, batch.actions)
-    assert len(q_values) == 2 and q_values[0].shape == (16, 1)
-    assert_same(everything(model), before)

@@ -29,18 +29,9 @@ ABOUTS = sorted(RESULTS.glob("*/*/about.md"))
 README = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
 make_tables: dict[str, Any] = runpy.run_path(str(RESULTS / "make_tables.py"))
 TASKS = ("cheetah-run", "walker-walk")
-# Means at 100,000 environment steps of SAC (in CrossQ's code) and DR.Q, from their published result files.
+# Means at 100,000 environment steps of SAC (in CrossQ's code) and DR.Q.
 PUBLISHED = {
-    "cheetah-run": (178, 638),
-    "walker-walk": (449, 936),
-    "reacher-hard": (602, 923),
-    "finger-spin": (475, 819),
-    "hopper-stand": (31, 347),
-    "quadruped-run": (74, 845),
-    "HalfCheetah-v4": (6156, 9439),
-    "Hopper-v4": (1103, 2258),
-    "Walker2d-v4": (690, 4151),
-    "Ant-v4": (747, 3817),
+    task: (sac, dr_q) for task, ((_, dr_q), sac) in runpy.run_path(str(RESULTS / "make_picture.py"))["PUBLISHED"].items()
 }
 
 

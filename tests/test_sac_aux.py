@@ -459,21 +459,6 @@ def test_what_a_step_moves(kind: str, settings: dict[str, Any]) -> None:
     assert not any(p.requires_grad or p.grad is not None for p in model.critic_target.parameters())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("joint", [False, True])
-def test_which_loss_moves_the_encoder(kind: str, joint: bool) -> None:
-    """With a learning rate of zero elsewhere only the auxiliary loss is left, and the other way round."""
-    frozen: dict[str, Any] = {"ent_coef_optimizer_kwargs": {"lr": 0.0}, "policy_delay": 1, "target_update_interval": 100}
-
-    def moved(learning_rate: float, aux_learning_rate: float, **settings: Any) -> set[str]:
-        aux_kwargs = {"learning_rate": aux_learning_rate, "joint": joint}
-        return moved_by_train(filled_model(kind, learning_rate=learning_rate, aux_kwargs=aux_kwargs, **frozen, **settings))
-
-    assert moved(0.0, 1e-3) == {"encoder", "head"}
-    assert moved(1e-3, 0.0) == ({"q", "actor"} if joint else {"encoder", "q", "actor"})
-    assert moved(1e-3, 0.0, aux_loss=None) == {"encoder", "q", "actor"}
-
-
 def test_learning_rates_and_coef(caplog: pytest.LogCaptureFixture, tmp_path: pathlib.Path) -> None:
     settings = {"learning_rate": 1e-3, "aux_kwargs": {"learning_rate": lambda left: 2e-3 * left}}
     model = make_model(ent_coef_optimizer_kwargs={"lr": 1e-2, "betas": (0.3, 0.99)}, **settings).learn(50)
@@ -658,22 +643,6 @@ def test_reading_q_values_changes_no_running_statistics(tmp_path: pathlib.Path) 
         before = copy.deepcopy(policy.state_dict())
         policy.critic(th.rand(8, 3), th.rand(8, 2))[0].sum().backward()
         assert_same(policy.state_dict(), before)
-
-
-@pytest.mark.parametrize("joint", [False, True])
-def test_parameters_include_the_auxiliary_ones(joint: bool) -> None:
-    trained = make_model(aux_kwargs={"joint": joint}).learn(60)
-    fresh = make_model(aux_kwargs={"joint": joint}, seed=9)
-    parameters = trained.get_parameters()
-    assert {"policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer", "aux_head", "aux_optimizer"} == set(
-        parameters
-    )
-    assert fresh.aux_optimizer.state_dict()["state"] == {}
-    fresh.set_parameters(parameters)
-    assert_same(fresh.get_parameters(), parameters)
-    del parameters["policy"]
-    with pytest.raises(ValueError, match="policy"):
-        fresh.set_parameters(parameters)
 
 
 @pytest.mark.parametrize("joint", [False, True])

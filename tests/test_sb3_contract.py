@@ -20,6 +20,7 @@ from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNo
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac.policies import CnnPolicy, SACPolicy
+from test_sac_aux import assert_same
 from torch import nn
 
 from sb3_aarl import SACAux, catalog
@@ -120,11 +121,6 @@ def assert_predicts(model: SACAux, observations: list[Any]) -> np.ndarray:
     return together
 
 
-def assert_equal_parameters(first: SACAux, second: SACAux) -> None:
-    for (name, one), other in zip(first.policy.state_dict().items(), second.policy.state_dict().values(), strict=True):
-        assert th.equal(one, other), name
-
-
 @pytest.mark.parametrize("method", ["__init__", "learn"])
 def test_defaults_are_those_of_sac(method: str) -> None:
     ours, sacs = (inspect.signature(getattr(cls, method)).parameters for cls in (SACAux, SAC))
@@ -199,7 +195,7 @@ def test_images_of_any_size(shape: tuple[int, int, int], encoded: tuple[int, int
     assert first.policy.augmentation == ("random_shift" if shape == encoded else "random_crop")
     assert_all_train(first)
     last = make_model(ChannelLast(RandomEnv(image_space(*shape))), **kwargs).learn(20)
-    assert_equal_parameters(first, last)
+    assert_same(first.policy.state_dict(), last.policy.state_dict())
 
     images = [image_space(*shape).sample() for _ in range(3)]
     actions = assert_predicts(first, images)
@@ -304,39 +300,6 @@ def test_action_noise(n_envs: int) -> None:
     model = make_model(DummyVecEnv([RandomEnv] * n_envs), action_noise=noise)
     assert_all_train(model)
     assert (model.replay_buffer.actions[: model.replay_buffer.size()] == 1).all()
-
-
-class UsersExtractor(BaseFeaturesExtractor):
-    """A features extractor that a user could have written for SAC; it knows nothing of this project."""
-
-    def __init__(self, observation_space: spaces.Space, features_dim: int = 6, width: int = 5):
-        super().__init__(observation_space, features_dim)
-        self.net = nn.Sequential(
-            nn.Flatten(), nn.Linear(3, width), nn.BatchNorm1d(width), nn.Tanh(), nn.Linear(width, features_dim)
-        )
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.net(observations)
-
-
-@pytest.mark.parametrize("share", [True, False])
-def test_users_features_extractor(share: bool) -> None:
-    policy_kwargs = {
-        "features_extractor_class": UsersExtractor,
-        "features_extractor_kwargs": {"features_dim": 9, "width": 4},
-        "share_features_extractor": share,
-    }
-    model = make_model(policy_kwargs=policy_kwargs)
-    assert model.critic.features_extractor.net[1].out_features == 4
-    assert_all_train(model)
-    # Batch norm: prediction leaves the running means alone, training moves them, and the target has a copy.
-    norm, target_norm = model.critic.features_extractor.net[2], model.critic_target.features_extractor.net[2]
-    before = norm.running_mean.clone()
-    assert_predicts(model, [VECTOR.sample() for _ in range(4)])
-    assert th.equal(norm.running_mean, before)
-    model.train(3, 4)
-    assert not th.equal(norm.running_mean, before)
-    assert model._n_updates % model.target_update_interval == 0 and th.equal(norm.running_mean, target_norm.running_mean)
 
 
 class AroundNetwork(BaseFeaturesExtractor):
@@ -502,7 +465,7 @@ def test_callbacks(tmp_path: Any) -> None:
     np.testing.assert_array_equal(loaded.replay_buffer.observations[:19], model.replay_buffer.observations[:19])
     best = SACAux.load(tmp_path / "best_model")
     checkpoint = SACAux.load(tmp_path / "model_10_steps")  # the first evaluation was the best, as all returns are equal
-    assert_equal_parameters(best, checkpoint)
+    assert_same(best.policy.state_dict(), checkpoint.policy.state_dict())
 
 
 @pytest.mark.filterwarnings("error:`n_steps")

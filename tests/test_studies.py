@@ -131,9 +131,6 @@ def test_a_search_from_python(config: SearchConfig, tmp_path: Path, executor: Pl
     assert stored_settings(search.study)["n_generations"] == 1
     assert [generation.filled for generation in more.run(executor).generations] == [3, 3]
     assert len(executor.runs) == 6
-    (tmp_path / "other.yml").write_text(config.path.read_text())
-    with pytest.raises(ValueError, match="mine is the folder of the search small"):
-        Search.from_file(tmp_path / "other.yml", tmp_path / "mine").run(executor)
 
 
 def test_a_file_is_read_once_and_its_settings_are_checked_once(

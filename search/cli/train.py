@@ -77,7 +77,7 @@ def losses(
     """List the losses that have a name."""
     from sb3_aarl import catalog
 
-    names = [*catalog.names(), *(candidate.name for candidate in catalog.published() if published)]
+    names = [*catalog.names(), *(catalog.published() if published else ())]
     table = Table("name", "notation")
     table.columns[1].overflow = "fold"
     for name in names:

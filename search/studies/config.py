@@ -219,7 +219,7 @@ class SearchConfig(_Evolution, BaseModel, frozen=True, extra="forbid"):
         if isinstance(value, str) and value.lower().endswith((".yml", ".yaml")):
             return (catalog.resolve(info.data["path"].parent / value),)
         if value == "published":
-            losses = [candidate.loss for candidate in catalog.published()]
+            losses = [*catalog.published().values()]
         elif value == "handcrafted":
             losses = [catalog.load(name) for name in catalog.names() if not name.startswith("aarl-")]
         else:

@@ -1,14 +1,12 @@
 """How far a search with the matrices in its folder is, or a benchmark. Nothing is started."""
 
 import inspect
-from collections import Counter
 from pathlib import Path
 
 import optuna
 import pandas as pd
 from optuna.storages import BaseStorage
-from optuna.trial import TrialState
-from sb3_aarl.search.evolution.sampler import AuxLossSampler, GenerationProgress
+from sb3_aarl.search.evolution.sampler import AuxLossSampler
 from sb3_aarl.search.execution import driver
 from sb3_aarl.search.execution.storage import has_driver
 from sb3_aarl.search.training.folder import read_outcome
@@ -21,19 +19,13 @@ PARTS = ("baselines", "cross-validation")
 
 
 def search_status(study: optuna.Study, storage: BaseStorage, folder: Path) -> tuple[driver.SearchProgress, bool]:
-    """
-    The progress of a search, and whether its driver runs. All trials of a study without an ``AuxLossSampler`` count as one
-    generation.
-    """
-    if settings := AuxLossSampler.stored_settings(study):
-        settings["initial"] = [AuxLoss.parse(loss) for loss in settings["initial"]]
-        arguments = {name: settings[name] for name in inspect.signature(AuxLossSampler).parameters if name in settings}
-        generations = AuxLossSampler(**arguments).progress(study)
-    else:
-        states = Counter(trial.state for trial in study.get_trials(deepcopy=False))
-        filled = states[TrialState.COMPLETE] + states[TrialState.PRUNED]
-        running, failed = states[TrialState.RUNNING], states[TrialState.FAIL]
-        generations = [GenerationProgress(1, sum(states.values()) - failed, filled, running, failed)]
+    """The progress of a search, and whether its driver runs."""
+    settings = AuxLossSampler.stored_settings(study)
+    if not settings:
+        raise ValueError(f"study {study.study_name!r} has no trial of an AuxLossSampler: there are no generations to count")
+    settings["initial"] = [AuxLoss.parse(loss) for loss in settings["initial"]]
+    arguments = {name: settings[name] for name in inspect.signature(AuxLossSampler).parameters if name in settings}
+    generations = AuxLossSampler(**arguments).progress(study)
     return driver.search_progress(study, generations), has_driver(storage, study.study_name, folder)
 
 

@@ -238,7 +238,7 @@ def _hyperparameters_model(is_dmc: bool) -> type[BaseModel]:
         SACAux,
         without=("env", "seed", "_init_setup_model"),
         policy=Literal[tuple(SACAux.policy_aliases)],
-        aux_loss=Annotated[str | dict[str, Any] | None, AfterValidator(_check_aux_loss)],
+        aux_loss=Annotated[str | None, AfterValidator(_check_aux_loss)],
         n_timesteps=PositiveInt,
         n_envs=PositiveInt,
         vec_env=Literal[tuple(VEC_ENVS)],
