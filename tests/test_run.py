@@ -194,10 +194,10 @@ def test_a_promoted_run_does_not_begin_again_with_random_actions(tmp_path: Path)
     settings = {key: value for key, value in DENSE.items() if key != "learning_starts"}
     prepare_run(tmp_path, make_run(hyperparameters=settings, keep_model=True))
     train(tmp_path, on_evaluation=lambda curve: (tmp_path / "stop").touch())
-    prepare_run(tmp_path, make_run(hyperparameters=settings, keep_model=True, checkpoints=(32, 64, 640)))
+    prepare_run(tmp_path, make_run(hyperparameters=settings, keep_model=True, checkpoints=(32, 64, 128)))
     train(tmp_path)
     model = SACAux.load(tmp_path / "model.zip")
-    assert model.learning_starts == 6 and model._n_updates == 640 - 6
+    assert model.learning_starts == 6 and model._n_updates == 128 - 6
 
 
 def test_a_candidate_that_fails_is_not_to_be_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
