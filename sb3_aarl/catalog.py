@@ -44,12 +44,13 @@ def load(name: str) -> AuxLoss:
     :raises ValueError: for an unknown name, with the nearest ones
     """
     key = str(name).strip().lower()
-    losses = {**_named(), **published()}
-    if key not in losses:
-        nearest = difflib.get_close_matches(key[:100], losses)
+    if key in _named():
+        return _named()[key]
+    if key not in published():
+        nearest = difflib.get_close_matches(key[:100], [*names(), *published()])
         hint = f"nearest: {', '.join(nearest)}" if nearest else f"known: {', '.join(names())}"
         raise ValueError(f"unknown auxiliary loss {name!r}, {hint}")
-    return losses[key]
+    return published()[key]
 
 
 @cache

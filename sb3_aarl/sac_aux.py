@@ -1,6 +1,7 @@
 """SACAux: Soft Actor-Critic whose encoder is also trained with an auxiliary loss."""
 
 import copy
+import io
 import logging
 import math
 import warnings
@@ -561,6 +562,13 @@ class SACAux(SAC):
         for name, value in state["counters"].items():
             setattr(self, name, value)
         self._q_value_check = QValueCheck(**state["q_value_check"])
+
+    def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        replay_buffer = vars(self).get("replay_buffer")
+        super().load_replay_buffer(path, truncate_last_traj)
+        if self.aux_loss is not None and not isinstance(self.replay_buffer, WindowReplayBuffer):
+            name, self.replay_buffer = type(self.replay_buffer).__name__, replay_buffer
+            raise ValueError(f"{name} has no windows, which aux_loss={self.aux_loss} needs: only aux_loss=None can load it")
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"

@@ -151,8 +151,7 @@ def test_a_killed_run_ends_like_an_undisturbed_one(case: str, tmp_path: Path, pr
     (curve, state), (expected_curve, expected_state) = result(folder), result(tmp_path / "undisturbed")
     assert curve == expected_curve and len(curve) == N_EVALUATIONS
     assert len({point[1] for point in curve}) > 1 or case == "normalize"  # or equality would say little
-    assert len(state["parameters"]) >= 6 and state["tensors"]
-    assert_same(state, expected_state)
+    assert assert_same(state, expected_state) > 40
     assert not (folder / "checkpoint.pt").exists() and not (folder / "checkpoint.tmp").exists()
 
 

@@ -117,20 +117,21 @@ def everything(model: SAC) -> dict[str, Any]:
     return copy.deepcopy(state)
 
 
-def assert_same(first: Any, second: Any, where: str = "") -> None:
-    """Bit for bit equality of nested parameters and optimizer states."""
+def assert_same(first: Any, second: Any, where: str = "") -> int:
+    """Bit for bit equality of nested parameters and optimizer states; returns how many tensors and arrays were compared."""
     if isinstance(first, dict):
         assert first.keys() == second.keys(), where
-        for key in first:
-            assert_same(first[key], second[key], f"{where}.{key}")
-    elif isinstance(first, (list, tuple)):
+        return sum(assert_same(first[key], second[key], f"{where}.{key}") for key in first)
+    if isinstance(first, (list, tuple)):
         assert len(first) == len(second), where
-        for i, pair in enumerate(zip(first, second, strict=True)):
-            assert_same(*pair, f"{where}[{i}]")
-    elif isinstance(first, (th.Tensor, np.ndarray)):
-        assert np.array_equal(np.asarray(first), np.asarray(second)), where
-    else:
-        assert first == second, where
+        return sum(assert_same(*pair, f"{where}[{i}]") for i, pair in enumerate(zip(first, second, strict=True)))
+    assert type(first) is type(second), where
+    if isinstance(first, (th.Tensor, np.ndarray)):
+        one, other = np.asarray(first), np.asarray(second)
+        assert one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes(), where
+        return 1
+    assert first == second, where
+    return 0
 
 
 # --- SB3's SAC ---------------------------------------------------------------------------------------------------------
